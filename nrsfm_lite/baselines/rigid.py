@@ -1,0 +1,77 @@
+"""Rigid structure from motion by factorisation (Tomasi & Kanade, 1992)."""
+
+import numpy as np
+import torch
+
+from ..cameras import nearest_orthonormal
+from ..data import Landmarks, Reconstruction, check_visible_finite
+
+
+def tomasi_kanade(W, visible=None):
+    """The one rigid shape, and a camera per frame, that explain all images best.
+
+    Objective: ``min Σ_f ‖W_f − S M_f‖²`` by the rank-3 singular value decomposition of all frames
+    stacked, then the metric upgrade that makes the cameras' columns orthonormal in the least-squares
+    sense (linear in the Gram matrix Q of the upgrade). Cost O(F P²). On a non-rigid motion it shows
+    what the cameras alone can explain.
+
+    Parameters
+    ----------
+    W : Landmarks, or (F, P, 2) array of image points
+    visible : (F, P) bool, optional
+        Must be all True: factorisation has no place for missing points.
+
+    Returns
+    -------
+    Reconstruction with the same shape in every frame.
+
+    Raises
+    ------
+    ValueError
+        With hidden points, fewer than 3 frames or 4 points, or if all points lie in one plane or the
+        views are all alike (rank below 3).
+    """
+    names, edges = (W.names, W.edges) if isinstance(W, Landmarks) else ((), ())
+    if isinstance(W, Landmarks):
+        W, visible = W.points2d, W.visible if visible is None else visible
+    W = np.asarray(W, float)
+    if W.ndim != 3 or W.shape[2] != 2:
+        raise ValueError(f"W has shape {W.shape}; expected (F, P, 2).")
+    F, P, _ = W.shape
+    visible = np.ones((F, P), bool) if visible is None else np.asarray(visible, bool)
+    if not visible.all():
+        raise ValueError(f"tomasi_kanade needs every point visible; {(~visible).sum()} are hidden.")
+    check_visible_finite("W", W, visible)
+    if F < 3 or P < 4:
+        raise ValueError(f"tomasi_kanade needs at least 3 frames and 4 points; got {F} and {P}.")
+    t = W.mean(1)
+    X = (W - t[:, None]).transpose(0, 2, 1).reshape(2 * F, P)  # rows: x and y of each frame
+    U, s, Vh = np.linalg.svd(X, full_matrices=False)
+    if s[2] < 1e-9 * s[0]:
+        raise ValueError("W has rank below 3: the points lie in one plane, or all views are alike.")
+    motion = (U[:, :3] * np.sqrt(s[:3])).reshape(F, 2, 3)
+    G = _metric_upgrade(motion)
+    M = nearest_orthonormal(torch.as_tensor((motion @ G).transpose(0, 2, 1).copy())).numpy()  # (F, 3, 2)
+    S = (np.linalg.solve(G, np.sqrt(s[:3])[:, None] * Vh[:3])).T  # (P, 3)
+    return Reconstruction(
+        shapes=np.broadcast_to(S - S.mean(0), (F, P, 3)).copy(),
+        cameras=M, translations=t, names=names, edges=edges, method="tomasi_kanade",
+    )  # fmt: skip
+
+
+def _metric_upgrade(motion):
+    """G (3, 3) such that the rows of motion_f @ G are orthonormal, in the least-squares sense."""
+    upper = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+
+    def row(a, b):  # aᵀ Q b as a linear function of the six entries of Q: (F, 6)
+        return np.stack([a[:, i] * b[:, j] + (a[:, j] * b[:, i] if i != j else 0) for i, j in upper], 1)
+
+    x, y = motion[:, 0], motion[:, 1]
+    system = np.concatenate([row(x, x), row(y, y), row(x, y)])
+    target = np.repeat([1.0, 1.0, 0.0], len(motion))
+    q = np.linalg.lstsq(system, target, rcond=None)[0]
+    Q = np.zeros((3, 3))
+    for value, (i, j) in zip(q, upper, strict=True):
+        Q[i, j] = Q[j, i] = value
+    values, vectors = np.linalg.eigh(Q)
+    return vectors * np.sqrt(np.maximum(values, 1e-6 * values.max()))

@@ -1,0 +1,110 @@
+"""Cameras: random ones, projection, and the nearest camera to a 3×2 matrix.
+
+A camera is a (3, 2) matrix M with orthonormal columns, MᵀM = I₂. A shape S (P, 3) is seen as
+W = S M + t (paper, eq. 6).
+"""
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+# A 3×2 block whose second singular value is below this share of its squared norm has no direction
+# to offer for the second column: the nearest camera is not unique and its gradient has no bound.
+_DEGENERATE = 1e-6
+
+
+def random_rotations(n, seed=0):
+    """(n, 3, 3) rotation matrices, uniform over SO(3). `seed` is an int or a NumPy Generator."""
+    return Rotation.random(n, rng=np.random.default_rng(seed)).as_matrix()
+
+
+def random_cameras(n, seed=0):
+    """(n, 3, 2) orthographic cameras from uniformly random directions, orthonormal columns."""
+    return random_rotations(n, seed)[:, :, :2]
+
+
+def project(S, M, t=None):
+    """Image points of shapes: W = S M + t.
+
+    Parameters
+    ----------
+    S : (..., P, 3) array or tensor
+    M : (..., 3, 2)
+    t : (..., 2), optional
+
+    Returns
+    -------
+    (..., P, 2)
+    """
+    W = S @ M
+    return W if t is None else W + t[..., None, :]
+
+
+def nearest_orthonormal(A):
+    """The camera nearest to each 3×2 matrix: its polar factor A (AᵀA)^(-1/2) = U Vᵀ, in closed form.
+
+    With n the unit normal of the two columns a₁, a₂, and σ₁, σ₂ the singular values,
+
+        M = ( A + [a₂ × n, n × a₁] ) / (σ₁ + σ₂),   σ₁ + σ₂ = sqrt(‖A‖² + 2 ‖a₁ × a₂‖).
+
+    The bracket is A with its two singular values swapped, so the sum has both equal. No singular
+    vectors are formed, which is why the gradient stays exact when σ₁ = σ₂ (chapter 07).
+
+    Parameters
+    ----------
+    A : (..., 3, 2) tensor
+
+    Returns
+    -------
+    (..., 3, 2) tensor, orthonormal columns
+        Where A is zero or has rank one, a fixed camera and a gradient of zero: there the nearest
+        camera is not unique, and the true gradient grows as 1/σ₂.
+
+    Raises
+    ------
+    ValueError
+        If the last two axes are not (3, 2).
+    """
+    if A.shape[-2:] != (3, 2):
+        raise ValueError(f"A has shape {tuple(A.shape)}; expected (..., 3, 2).")
+    size = A.detach().square().sum((-2, -1), keepdim=True)  # ‖A‖²
+    scaled = A / torch.where(size > 0, size, torch.ones_like(size)).sqrt()  # no under- or overflow below
+    area = torch.linalg.cross(scaled.detach()[..., 0], scaled.detach()[..., 1]).norm(dim=-1)  # σ₁ σ₂
+    degenerate = ~(area > _DEGENERATE)[..., None, None] | ~(size > 0)  # also catches NaN
+    fixed = torch.eye(3, 2, dtype=A.dtype, device=A.device)
+    a1, a2 = torch.where(degenerate, fixed, scaled).unbind(-1)  # each (..., 3)
+    normal = torch.linalg.cross(a1, a2)
+    area = normal.norm(dim=-1, keepdim=True)
+    n = normal / area
+    swapped = torch.stack([torch.linalg.cross(a2, n), torch.linalg.cross(n, a1)], -1)
+    both = torch.stack([a1, a2], -1)
+    total = (both.square().sum((-2, -1)) + 2 * area[..., 0]).sqrt()  # σ₁ + σ₂
+    return (both + swapped) / total[..., None, None]
+
+
+def rotation_error(M, M_true, degrees=True):
+    """Angle between estimated and true cameras after the best common rotation or reflection.
+
+    The world frame of a reconstruction is arbitrary, and so is its mirror image. One orthogonal Q
+    for all frames takes that freedom out: Q = argmin Σ‖Q M_f − M_f*‖².
+
+    Parameters
+    ----------
+    M, M_true : (F, 3, 2) arrays, orthonormal columns
+
+    Returns
+    -------
+    (F,) angles between the completed rotations, in degrees (radians with ``degrees=False``).
+    """
+    M, M_true = np.asarray(M, float), np.asarray(M_true, float)
+    if M.shape != M_true.shape or M.shape[1:] != (3, 2):
+        raise ValueError(f"M and M_true have shapes {M.shape} and {M_true.shape}; expected (F, 3, 2) twice.")
+    U, _, Vh = np.linalg.svd(np.einsum("fij,fkj->ik", M_true, M))
+    aligned = (U @ Vh) @ M
+
+    def complete(C):
+        return np.concatenate([C, np.cross(C[..., 0], C[..., 1])[..., None]], -1)
+
+    relative = complete(aligned).swapaxes(1, 2) @ complete(M_true)
+    angle = Rotation.from_matrix(relative).magnitude()
+    return np.degrees(angle) if degrees else angle

@@ -1,0 +1,118 @@
+"""The `nrsfm` command."""
+
+import argparse
+import sys
+from pathlib import Path
+
+from . import __version__, datasets, metrics, plotting
+from .data import Reconstruction
+from .reconstruction import reconstruct
+
+_FORMATS = ("npz", "bvh")
+
+
+def main(argv=None):
+    """Run the command line; returns the exit code: 0, or 2 after one sentence on bad input."""
+    arguments = _parser().parse_args(argv)
+    try:
+        arguments.run(arguments)
+    except (ValueError, OSError, KeyError) as error:
+        # A KeyError prints its message in quotes; its first argument is the sentence itself.
+        sentence = error.args[0] if isinstance(error, KeyError) else error
+        print(f"nrsfm: {sentence}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("nrsfm: interrupted.", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser():
+    parser = argparse.ArgumentParser(
+        prog="nrsfm", description="Non-rigid structure from motion: 2D landmarks in, 3D shapes and cameras out."
+    )
+    parser.add_argument("--version", action="version", version=f"nrsfm {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    make = commands.add_parser(
+        "reconstruct",
+        help="2D landmarks in, 3D out",
+        description="Reconstruct the landmarks of FILE. A file of 3D motion is first photographed by one "
+        "random orthographic camera per frame, and the error against its truth is printed.",
+    )
+    make.add_argument("file", type=Path, metavar="FILE")
+    make.add_argument("--format", choices=("auto", *_FORMATS), default="auto", help="default: by the file's ending")
+    make.add_argument("--out", type=Path, metavar="SCENE.html", help="write a 3D scene that opens offline")
+    make.add_argument("--save", type=Path, metavar="RESULT.npz", help="keep shapes, cameras and the network")
+    make.add_argument("--joints", metavar="A,B,…", help="bvh: only these joints, or 'cmu' for a 31-point body")
+    make.add_argument("--every", type=int, default=1, metavar="N", help="bvh: keep every N-th frame")
+    make.add_argument("--steps", type=int, help="training steps")
+    make.add_argument("--seed", type=int, default=0)
+    make.add_argument("--checkpoint", type=Path, help="keep the state here, and go on from it if it exists")
+    make.add_argument("--quiet", action="store_true", help="no progress bar")
+    make.set_defaults(run=_reconstruct)
+
+    view = commands.add_parser("view", help="a saved reconstruction as a 3D scene")
+    view.add_argument("file", type=Path, metavar="RESULT.npz")
+    view.add_argument("--out", type=Path, required=True, metavar="SCENE.html")
+    view.set_defaults(run=_view)
+    return parser
+
+
+def _reconstruct(arguments):
+    for target in (arguments.out, arguments.save):
+        if target is not None and not target.parent.is_dir():
+            raise FileNotFoundError(f"{target.parent}: no such folder to write {target.name} to.")
+    data = _load(arguments)
+    if data.points2d is None:
+        data = datasets.make_views(data, seed=arguments.seed)
+        print(f"{len(data)} frames of {data.n_points} points, seen by one random orthographic camera each")
+    else:
+        print(f"{len(data)} frames of {data.n_points} points")
+    rec = reconstruct(
+        data, seed=arguments.seed, steps=arguments.steps, checkpoint=arguments.checkpoint, progress=not arguments.quiet
+    )
+    if data.points3d is not None:
+        error = metrics.normalized_error(rec.shapes, data.points3d).mean()
+        flips = metrics.handedness(rec.shapes, data.points3d)
+        print(f"mean normalised 3D error: {error:.4f} (per frame up to rotation, mirror and scale)")
+        print(f"frames of the other handedness: {flips:.1%}")
+    print(f"coherence of the last dictionary: {rec.coherence:.3f} (lower is better)")
+    if arguments.save:
+        rec.save(arguments.save)
+        print(f"wrote {arguments.save}")
+    if arguments.out:
+        truth = data.points3d
+        figure = plotting.show3d(rec, truth=truth, max_frames=150, title=arguments.file.name, height=700)
+        plotting.write_html(figure, arguments.out)
+        print(f"wrote {arguments.out}")
+
+
+def _load(arguments):
+    file = arguments.file
+    if not file.exists():
+        raise FileNotFoundError(f"{file}: no such file.")
+    kind = arguments.format
+    if kind == "auto":
+        kind = "bvh" if file.is_dir() else file.suffix.lower().removeprefix(".")
+    if kind == "npz":
+        return datasets.load_npz(file)
+    if kind == "bvh":
+        joints = arguments.joints
+        if joints is not None:
+            joints = datasets.CMU_BODY if joints == "cmu" else joints.split(",")
+        return datasets.load_bvh(file, joints=joints, every=arguments.every)
+    if file.stat().st_size == 0:
+        raise ValueError(f"{file}: the file is empty.")
+    raise ValueError(f"{file}: cannot tell the format from its ending; give --format {' or '.join(_FORMATS)}.")
+
+
+def _view(arguments):
+    rec = Reconstruction.load(arguments.file)
+    figure = plotting.show3d(rec, max_frames=150, title=arguments.file.name, height=700)
+    plotting.write_html(figure, arguments.out)
+    print(f"wrote {arguments.out}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,274 @@
+"""The two things that travel between the modules: what was seen, and what was reconstructed.
+
+`Landmarks` holds 2D points with, where it is known, the 3D truth. `Reconstruction` holds what a
+method made of them. Both are plain dataclasses of NumPy arrays and are saved without pickle.
+"""
+
+import json
+import zipfile
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+
+import numpy as np
+
+# The per-frame arrays of Landmarks: name -> (shape with F frames and P points, dtype).
+_FRAME_ARRAYS = {
+    "points2d": ("F", "P", 2),
+    "visible": ("F", "P"),
+    "confidence": ("F", "P"),
+    "points3d": ("F", "P", 3),
+    "cameras": ("F", 3, 2),
+    "translations": ("F", 2),
+    "sequence": ("F",),
+}
+
+
+@dataclass
+class Landmarks:
+    """2D landmarks of F frames with P points each, and the truth where it is known.
+
+    Attributes
+    ----------
+    points2d : (F, P, 2) float or None
+        Image coordinates; a hidden point may be NaN. None for a motion nobody has photographed yet.
+    visible : (F, P) bool
+        False where a point is missing. Default: everything is visible.
+    confidence : (F, P) float or None
+    points3d : (F, P, 3) float or None
+        The true shapes. Only for evaluation and for making views.
+    cameras : (F, 3, 2) float or None
+        The true cameras, orthonormal columns; ``points2d = points3d @ camera + translation``.
+    translations : (F, 2) float or None
+    sequence : (F,) int
+        Which motion or file a frame comes from. Default: all from one.
+    names : tuple of P str
+    edges : (E, 2) int
+        Pairs of points that a drawing connects.
+    name : str
+
+    Raises
+    ------
+    ValueError
+        If neither points2d nor points3d is given, if a shape does not fit, or if a visible point
+        is not a finite number.
+    """
+
+    points2d: np.ndarray | None = None
+    visible: np.ndarray | None = None
+    confidence: np.ndarray | None = None
+    points3d: np.ndarray | None = None
+    cameras: np.ndarray | None = None
+    translations: np.ndarray | None = None
+    sequence: np.ndarray | None = None
+    names: tuple = ()
+    edges: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
+    name: str = "landmarks"
+
+    def __post_init__(self):
+        first = self.points2d if self.points2d is not None else self.points3d
+        if first is None:
+            raise ValueError("Landmarks needs points2d (F, P, 2) or points3d (F, P, 3); got neither.")
+        if np.ndim(first) != 3:
+            raise ValueError(f"points2d and points3d have three axes, (F, P, 2) and (F, P, 3); got {np.shape(first)}.")
+        n_frames, n_points = np.shape(first)[:2]
+        if self.visible is None:
+            self.visible = np.ones((n_frames, n_points), bool)
+        if self.sequence is None:
+            self.sequence = np.zeros(n_frames, int)
+        for key, axes in _FRAME_ARRAYS.items():
+            value = getattr(self, key)
+            if value is None:
+                continue
+            expected = tuple({"F": n_frames, "P": n_points}.get(a, a) for a in axes)
+            value = _as_array(key, value, {"visible": bool, "sequence": int}.get(key, float))
+            if value.shape != expected:
+                raise ValueError(f"{key} has shape {value.shape}; expected {expected}.")
+            setattr(self, key, value)
+        if self.points2d is not None:
+            check_visible_finite("points2d", self.points2d, self.visible)
+        if self.points3d is not None and not np.isfinite(self.points3d).all():
+            raise ValueError("points3d has values that are not finite numbers.")
+        self.names = tuple(str(n) for n in self.names) or tuple(f"point_{i}" for i in range(n_points))
+        if len(self.names) != n_points:
+            raise ValueError(f"names has {len(self.names)} entries for {n_points} points.")
+        self.edges = np.asarray(self.edges, int).reshape(-1, 2)
+        if self.edges.size and not (self.edges.min() >= 0 and self.edges.max() < n_points):
+            raise ValueError(f"edges refers to a point outside 0 … {n_points - 1}.")
+
+    def __len__(self):
+        return len(self.visible)
+
+    @property
+    def n_points(self):
+        """P, the number of points."""
+        return self.visible.shape[1]
+
+    def __getitem__(self, frames):
+        """The same landmarks with only some frames: a slice, indices or a boolean mask."""
+        if isinstance(frames, (int, np.integer)):
+            frames = [frames]
+        chosen = {key: None if getattr(self, key) is None else getattr(self, key)[frames] for key in _FRAME_ARRAYS}
+        return Landmarks(**chosen, names=self.names, edges=self.edges, name=self.name)
+
+    def split(self, test=0.2):
+        """(train, test) by whole sequences: the last max(1, round(test · n)) sequences are the test.
+
+        Raises ValueError with fewer than two sequences, or if nothing is left to train on.
+        """
+        ids = np.unique(self.sequence)
+        n_test = max(1, round(test * len(ids)))
+        if n_test >= len(ids):
+            raise ValueError(f"split(test={test}) needs sequences on both sides; these landmarks have {len(ids)}.")
+        unseen = np.isin(self.sequence, ids[-n_test:])
+        return self[~unseen], self[unseen]
+
+    def save(self, path):
+        """Write an .npz that `datasets.load_npz` reads."""
+        arrays = {key: getattr(self, key) for key in _FRAME_ARRAYS if getattr(self, key) is not None}
+        np.savez_compressed(
+            _npz(path), names=np.array(self.names), edges=self.edges, name=np.array(self.name), **arrays
+        )
+
+
+@dataclass
+class Reconstruction:
+    """What a method made of F frames: ``projections == shapes @ cameras + translations[:, None]``.
+
+    Attributes
+    ----------
+    shapes : (F, P, 3)
+        Centred over the points, in the units of the input.
+    cameras : (F, 3, 2)
+        Orthonormal columns.
+    translations : (F, 2)
+        The image of the centroid of all points.
+    visible : (F, P) bool
+        What the method was shown.
+    names, edges
+        As in `Landmarks`.
+    coherence : float or None
+        Mutual coherence of the last dictionary (chapter 10); None for methods without one.
+    method : str
+    converged : bool
+        False if the method was stopped before it was done.
+    model : DeepNRSfM or None
+        The trained network, to be used again on new frames.
+    """
+
+    shapes: np.ndarray
+    cameras: np.ndarray
+    translations: np.ndarray | None = None
+    visible: np.ndarray | None = None
+    names: tuple = ()
+    edges: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
+    coherence: float | None = None
+    method: str = ""
+    converged: bool = True
+    model: object = None
+
+    def __post_init__(self):
+        self.shapes = _as_array("shapes", self.shapes, float)
+        if self.shapes.ndim != 3 or self.shapes.shape[2] != 3:
+            raise ValueError(f"shapes has shape {self.shapes.shape}; expected (F, P, 3).")
+        n_frames, n_points = self.shapes.shape[:2]
+        if self.translations is None:
+            self.translations = np.zeros((n_frames, 2))
+        if self.visible is None:
+            self.visible = np.ones((n_frames, n_points), bool)
+        for key, dtype, expected in [
+            ("cameras", float, (n_frames, 3, 2)),
+            ("translations", float, (n_frames, 2)),
+            ("visible", bool, (n_frames, n_points)),
+        ]:
+            value = _as_array(key, getattr(self, key), dtype)
+            if value.shape != expected:
+                raise ValueError(f"{key} has shape {value.shape}; expected {expected}.")
+            setattr(self, key, value)
+        self.names = tuple(str(n) for n in self.names)
+        self.edges = np.asarray(self.edges, int).reshape(-1, 2)
+
+    def __len__(self):
+        return len(self.shapes)
+
+    @property
+    def projections(self):
+        """(F, P, 2), the shapes seen by their cameras, in the units of the input."""
+        return self.shapes @ self.cameras + self.translations[:, None]
+
+    def save(self, path):
+        """Write everything, the network's weights included, to one .npz without pickle."""
+        arrays = {}
+        if self.model is not None:
+            config, weights = self.model.to_arrays()
+            arrays = {"config": np.array(json.dumps(config)), **{f"model/{k}": v for k, v in weights.items()}}
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if f.name != "model" and value is not None:
+                arrays[f.name] = np.array(value)
+        np.savez_compressed(_npz(path), **arrays)
+
+    @classmethod
+    def load(cls, path):
+        """Read what `save` wrote.
+
+        Raises FileNotFoundError if there is no such file, ValueError if it is not a reconstruction.
+        """
+        arrays = read_npz(path)
+        if not {"shapes", "cameras"} <= arrays.keys():
+            raise ValueError(f"{path}: not a saved reconstruction (it has {', '.join(sorted(arrays)) or 'nothing'}).")
+        values = {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
+        for key in {"coherence", "method", "converged"} & values.keys():
+            values[key] = values[key].item()
+        values["names"] = tuple(values.get("names", ()))
+        if "config" in arrays:
+            # Imported here: this module is the bottom of the package, and only a saved network
+            # has to know how a network is built.
+            from .model import DeepNRSfM
+
+            weights = {k.removeprefix("model/"): v for k, v in arrays.items() if k.startswith("model/")}
+            values["model"] = DeepNRSfM.from_arrays(json.loads(arrays["config"].item()), weights)
+        return cls(**values)
+
+
+def check_visible_finite(key, points, visible):
+    """Raise ValueError if a visible point of `points` (F, P, d) is not finite, naming the first frame."""
+    bad = visible & ~np.isfinite(points).all(-1)
+    if bad.any():
+        frame = int(np.argwhere(bad)[0, 0])
+        raise ValueError(
+            f"{key} has {int(bad.sum())} visible points that are NaN or infinite (the first in frame {frame}); "
+            "mark missing points as False in visible."
+        )
+
+
+def read_npz(path):
+    """All arrays of an .npz file as a dict, never unpickling.
+
+    Raises FileNotFoundError if there is no such file, ValueError if it is empty, broken or holds objects.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file.")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path}: the file is empty.")
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path}: not an .npz file, or a truncated one.")
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {key: archive[key] for key in archive.files}
+    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise ValueError(f"{path}: could not be read as .npz ({error}).") from None
+
+
+def _as_array(key, value, dtype):
+    if hasattr(value, "detach"):
+        value = value.detach().cpu().numpy()
+    try:
+        return np.asarray(value, dtype)
+    except (TypeError, ValueError):
+        raise ValueError(f"{key} cannot be read as an array of {dtype.__name__}.") from None
+
+
+def _npz(path):
+    path = Path(path)
+    return path if path.suffix == ".npz" else path.with_name(path.name + ".npz")

@@ -1,0 +1,207 @@
+"""Biovision hierarchy (.bvh) motion capture files."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..data import Landmarks
+from .skeleton import forward_kinematics, kept_edges
+
+# A 31-point body in the public BVH conversion of the CMU motion capture database: the paper's
+# number of points, without the inner joints of the fingers.
+CMU_BODY = (
+    "hip", "abdomen", "chest", "neck", "head", "leftEye_end", "rightEye_end",
+    *(side + part for side in "rl" for part in (
+        "Collar", "Shldr", "ForeArm", "Hand", "Thumb2_end", "Mid2_end", "Pinky2_end")),
+    *(side + part for side in "rl" for part in ("Buttock", "Thigh", "Shin", "Foot", "Foot_end")),
+)  # fmt: skip
+
+
+def load_bvh(path, joints=None, every=1):
+    """3D joint positions of one or many .bvh files, as `Landmarks` with points3d.
+
+    Parameters
+    ----------
+    path : path, list of paths, or folder
+        All files must have the joints asked for. Each file is one sequence, in name order for a folder.
+    joints : sequence of str, optional
+        Names of the joints to keep, in this order; an end site is called ``<parent>_end``.
+        Default: every joint and end site. ``datasets.CMU_BODY`` is a 31-point choice.
+    every : int
+        Keep every n-th frame of each file.
+
+    Returns
+    -------
+    Landmarks with points3d (F, P, 3), sequence, names and edges; y is up in most files.
+
+    Raises
+    ------
+    FileNotFoundError
+        If a path does not exist or a folder has no .bvh file.
+    KeyError
+        If a joint is not in a file.
+    ValueError
+        If a file is empty, broken or truncated (with file and line), or if `every` is below 1.
+    """
+    if int(every) != every or every < 1:
+        raise ValueError(f"every={every}; expected a whole number of at least 1.")
+    files = _files(path)
+    points, sequence = [], []
+    names = edges = None
+    for i, file in enumerate(files):
+        all_names, parents, positions = read_bvh(file, every)
+        wanted = tuple(all_names if joints is None else joints)
+        missing = [j for j in wanted if j not in all_names]
+        if missing:
+            raise KeyError(f"{file}: no joint named {', '.join(missing)}; it has {', '.join(all_names)}.")
+        if names is not None and wanted != names:
+            raise ValueError(f"{file}: other joints than {files[0]}; choose common ones with joints=.")
+        keep = [all_names.index(j) for j in wanted]
+        names, edges = wanted, kept_edges(parents, keep)
+        points.append(positions[:, keep])
+        sequence.append(np.full(len(positions), i))
+    label = Path(path).stem if isinstance(path, (str, Path)) else "bvh"
+    return Landmarks(
+        points3d=np.concatenate(points), sequence=np.concatenate(sequence), names=names, edges=edges, name=label
+    )
+
+
+def read_bvh(file, every=1):
+    """Names (J), parents (J) and positions (F, J, 3) of all joints and end sites of one file."""
+    file = Path(file)
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: no such file.")
+    lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    if not any(line.strip() for line in lines):
+        raise ValueError(f"{file}: the file is empty.")
+    names, parents, offsets, channels, at = _hierarchy(file, lines)
+    motion = _motion(file, lines, at, sum(len(c) for c in channels))[::every]
+    rotations = np.broadcast_to(np.eye(3), (len(motion), len(names), 3, 3)).copy()
+    moved = np.broadcast_to(offsets, (len(motion), len(names), 3)).copy()
+    column = 0
+    for j, joint_channels in enumerate(channels):
+        values = motion[:, column : column + len(joint_channels)]
+        column += len(joint_channels)
+        turns = [k for k, c in enumerate(joint_channels) if c.endswith("rotation")]
+        for k, channel in enumerate(joint_channels):
+            if channel.endswith("position"):  # takes the place of that coordinate of OFFSET
+                moved[:, j, "xyz".index(channel[0])] = values[:, k]
+        if turns:
+            order = "".join(joint_channels[k][0].upper() for k in turns)  # capitals: intrinsic, as listed
+            rotations[:, j] = Rotation.from_euler(order, values[:, turns], degrees=True).as_matrix()
+    return names, parents, forward_kinematics(parents, moved, rotations)
+
+
+def _files(path):
+    if not isinstance(path, (str, Path)):
+        return [Path(p) for p in path]
+    path = Path(path)
+    if not path.is_dir():
+        return [path]
+    files = sorted(p for p in path.iterdir() if p.suffix.lower() == ".bvh")
+    if not files:
+        raise FileNotFoundError(f"{path}: no .bvh file in this folder.")
+    return files
+
+
+def _hierarchy(file, lines):
+    """Names, parents, offsets (J, 3), channel names per joint, and the line where MOTION stands."""
+    tokens = [(token, n) for n, line in enumerate(lines, 1) for token in line.split()]
+    names, parents, offsets, channels, stack = [], [], [], [], []
+    position = 0
+
+    def fail(message, n=None):
+        raise ValueError(f"{file}, line {n or tokens[min(position, len(tokens)) - 1][1]}: {message}")
+
+    def take():
+        nonlocal position
+        if position >= len(tokens):
+            fail("the file ends inside the hierarchy.")
+        position += 1
+        return tokens[position - 1]
+
+    def number():
+        token, n = take()
+        try:
+            return float(token)
+        except ValueError:
+            fail(f"expected a number, found {token!r}.", n)
+
+    if tokens[0][0].upper() != "HIERARCHY":
+        fail("not a BVH file: it does not begin with HIERARCHY.", tokens[0][1])
+    position = 1
+    pending = None  # the joint whose opening brace comes next
+    while True:
+        token, n = take()
+        word = token.upper()
+        if word in ("ROOT", "JOINT", "END"):
+            if (word == "ROOT") != (not stack):
+                fail(f"{token} in the wrong place.", n)
+            label, _ = take()
+            parents.append(stack[-1] if stack else -1)
+            names.append(f"{names[stack[-1]]}_end" if word == "END" else label)
+            offsets.append(np.zeros(3))
+            channels.append(())
+            pending = len(names) - 1
+        elif word == "{":
+            if pending is None:
+                fail("'{' without a joint.", n)
+            stack.append(pending)
+            pending = None
+        elif word == "}":
+            if not stack:
+                fail("'}' without a '{'.", n)
+            stack.pop()
+        elif word == "OFFSET" and stack:
+            offsets[stack[-1]] = np.array([number() for _ in range(3)])
+        elif word == "CHANNELS" and stack:
+            channels[stack[-1]] = tuple(take()[0].lower() for _ in range(int(number())))
+            unknown = [c for c in channels[stack[-1]] if not re.fullmatch("[xyz](position|rotation)", c)]
+            if unknown:
+                fail(f"unknown channel {unknown[0]!r}.", n)
+        elif word == "MOTION" and not stack and names:
+            return names, parents, np.array(offsets), channels, n
+        else:
+            fail(f"unexpected {token!r} in the hierarchy.", n)
+
+
+def _motion(file, lines, at, n_channels):
+    """The numbers under MOTION, which stands in line `at`: (F, n_channels)."""
+    rest = [(n, line) for n, line in enumerate(lines[at:], at + 1) if line.strip()]
+    count = re.fullmatch(r"\s*frames:\s*(\d+)\s*", rest[0][1], re.I) if rest else None
+    if not count:
+        raise ValueError(f"{file}, line {at + 1}: expected 'Frames: n' after MOTION.")
+    if len(rest) < 2 or not re.match(r"\s*frame\s+time:", rest[1][1], re.I):
+        raise ValueError(f"{file}, line {rest[0][0] + 1}: expected 'Frame Time: seconds'.")
+    n_frames, rows = int(count[1]), rest[2:]
+    if n_frames == 0:
+        raise ValueError(f"{file}, line {rest[0][0]}: the file has no frames.")
+    try:
+        values = np.array(" ".join(line for _, line in rows).split(), float)
+    except ValueError:
+        values = None
+    if values is None or values.size != n_frames * n_channels or not np.isfinite(values).all():
+        _explain_motion(file, rows, n_frames, n_channels, last=rest[-1][0])
+    return values.reshape(n_frames, n_channels)
+
+
+def _explain_motion(file, rows, n_frames, n_channels, last):
+    """Raise ValueError for the first line of the motion that is wrong."""
+    for n, line in rows:
+        for token in line.split():
+            try:
+                finite = np.isfinite(float(token))
+            except ValueError:
+                raise ValueError(f"{file}, line {n}: expected a number, found {token!r}.") from None
+            if not finite:
+                raise ValueError(f"{file}, line {n}: a motion value is {token}.")
+        if len(line.split()) != n_channels:
+            raise ValueError(
+                f"{file}, line {n}: {len(line.split())} values, expected {n_channels}; the file may be truncated."
+            )
+    raise ValueError(
+        f"{file}, line {last}: {len(rows)} frames of motion, but 'Frames: {n_frames}' promised; "
+        "the file may be truncated."
+    )

@@ -1,0 +1,104 @@
+"""How far a reconstruction is from the truth, and up to what.
+
+A reconstruction from orthographic images is known only up to a rotation and a mirror image, so
+every error first aligns the two shapes of a frame. Each function says which freedom it grants;
+numbers of different functions are never compared.
+"""
+
+import numpy as np
+
+
+def align(S, S_true, *, scale=True, reflections=True):
+    """Move each predicted shape onto its true one.
+
+    Both are centred over their points; then the best orthogonal matrix per frame is applied
+    (orthogonal Procrustes, by SVD).
+
+    Parameters
+    ----------
+    S, S_true : (F, P, 3) arrays or tensors
+    scale : bool
+        First scale the prediction to the norm of the truth, as the paper's authors do.
+    reflections : bool
+        Allow mirror images, O(3). With False only rotations, SO(3).
+
+    Returns
+    -------
+    aligned, centred : (F, P, 3) float64
+        The moved prediction and the truth with its centroid at zero.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or a value is not finite, or if a true shape has all points equal.
+    """
+    S, S_true = _pair(S, S_true)
+    S = S - S.mean(1, keepdims=True)
+    S_true = S_true - S_true.mean(1, keepdims=True)
+    if scale:
+        size = np.linalg.norm(S, axis=(1, 2))
+        S = S * (np.linalg.norm(S_true, axis=(1, 2)) / np.where(size > 0, size, 1))[:, None, None]
+    U, _, Vh = np.linalg.svd(S.swapaxes(1, 2) @ S_true)  # (F, 3, 3)
+    if not reflections:
+        U[:, :, -1] *= np.sign(np.linalg.det(U @ Vh))[:, None]  # the weakest direction pays
+    return S @ (U @ Vh), S_true
+
+
+def normalized_error(S, S_true, *, scale=True, reflections=True):
+    """Normalised 3D error per frame, ‖S − S*‖_F / ‖S*‖_F after `align` (paper, experiments).
+
+    Parameters as in `align`. ``scale=True`` is the evaluation of the paper's authors;
+    ``scale=False`` is the common per-frame error of the classical literature.
+
+    Returns
+    -------
+    (F,) array; the number that papers print is its mean.
+    """
+    S, S_true = align(S, S_true, scale=scale, reflections=reflections)
+    return np.linalg.norm(S - S_true, axis=(1, 2)) / np.linalg.norm(S_true, axis=(1, 2))
+
+
+def handedness(S, S_true):
+    """Share of frames whose handedness disagrees with the majority's.
+
+    One mirror image for all frames is a convention; frames that flip one by one are an error that
+    `normalized_error` with its reflections hides and a video shows at once. A frame counts as
+    mirrored if its best orthogonal alignment has a negative determinant.
+
+    Returns
+    -------
+    float in [0, 0.5]; 0 if all frames agree.
+    """
+    S, S_true = _pair(S, S_true)
+    S, S_true = S - S.mean(1, keepdims=True), S_true - S_true.mean(1, keepdims=True)
+    # det of the best orthogonal matrix has the sign of det(Sᵀ S*)
+    mirrored = np.mean(np.linalg.det(S.swapaxes(1, 2) @ S_true) < 0)
+    return float(min(mirrored, 1 - mirrored))
+
+
+def mpjpe(S, S_true):
+    """Mean distance per point after centring only, in the units of the truth: (F,)."""
+    S, S_true = _pair(S, S_true)
+    difference = (S - S.mean(1, keepdims=True)) - (S_true - S_true.mean(1, keepdims=True))
+    return np.linalg.norm(difference, axis=2).mean(1)
+
+
+def pa_mpjpe(S, S_true):
+    """Mean distance per point after the best similarity without mirroring, in the truth's units: (F,).
+
+    Scale, rotation and translation per frame are the least-squares optimum.
+    """
+    S, S_true = align(S, S_true, reflections=False)
+    best = (S * S_true).sum((1, 2)) / np.maximum((S * S).sum((1, 2)), np.finfo(float).tiny)
+    return np.linalg.norm(best[:, None, None] * S - S_true, axis=2).mean(1)
+
+
+def _pair(S, S_true):
+    S, S_true = (np.asarray(x.detach().cpu() if hasattr(x, "detach") else x, dtype=float) for x in (S, S_true))
+    if S.shape != S_true.shape or S.ndim != 3 or S.shape[2] != 3:
+        raise ValueError(f"S and S_true have shapes {S.shape} and {S_true.shape}; expected (F, P, 3) twice.")
+    if not (np.isfinite(S).all() and np.isfinite(S_true).all()):
+        raise ValueError("S and S_true must hold finite numbers only.")
+    if (np.ptp(S_true, axis=1) == 0).all(-1).any():
+        raise ValueError("S_true has a frame whose points are all equal; a relative error has no meaning there.")
+    return S, S_true

@@ -1,0 +1,188 @@
+"""The network of the paper: a block-sparse encoder, a camera, and a decoder with the same dictionaries.
+
+Shapes in comments: B frames, P points, K_i atoms of dictionary i, N dictionaries.
+"""
+
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+from torch import nn
+
+from . import preprocessing
+from .cameras import nearest_orthonormal
+from .sparse_coding import mutual_coherence
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides the form of a network; the defaults are the paper's for motion capture.
+
+    Parameters
+    ----------
+    n_points : int
+        P.
+    n_dictionaries : int
+        N, the depth.
+    first_atoms, last_atoms : int
+        K₁ and K_N; the widths between are ``linspace(K₁, K_N, N)`` cut to integers.
+    beta : "full" or "shared"
+        How the sparse code is read off the last blocks. "shared": one weight per entry of a block
+        (paper, eq. 24). "full": a linear map of all entries of all blocks (the authors' code).
+    output_bias : bool
+        Add a learned mean shape S̄ (the authors' code) to the last, linear layer.
+    projection : "orthographic" or "weak_perspective"
+        One scale for the whole set, or one per frame that goes into the shape.
+
+    Raises
+    ------
+    ValueError
+        If a value is outside its range.
+    """
+
+    n_points: int
+    n_dictionaries: int = 12
+    first_atoms: int = 125
+    last_atoms: int = 10
+    beta: str = "full"
+    output_bias: bool = True
+    projection: str = "orthographic"
+
+    def __post_init__(self):
+        if self.n_points < 3:
+            raise ValueError(f"n_points is {self.n_points}; a shape needs at least 3 points.")
+        if self.n_dictionaries < 1:
+            raise ValueError(f"n_dictionaries is {self.n_dictionaries}; expected at least 1.")
+        if not self.first_atoms >= self.last_atoms >= 2:
+            raise ValueError(
+                f"first_atoms={self.first_atoms}, last_atoms={self.last_atoms}; "
+                "expected first_atoms >= last_atoms >= 2."
+            )
+        for key, options in [("beta", ("full", "shared")), ("projection", ("orthographic", "weak_perspective"))]:
+            if getattr(self, key) not in options:
+                raise ValueError(f"{key}={getattr(self, key)!r}; expected one of {', '.join(options)}.")
+
+    @property
+    def widths(self):
+        """[K₁, …, K_N]."""
+        return np.linspace(self.first_atoms, self.last_atoms, self.n_dictionaries).astype(int).tolist()
+
+
+class DeepNRSfM(nn.Module):
+    """Deep NRSfM with 3×2 blocks: 2D landmarks in, 3D shapes and cameras out.
+
+    ``DeepNRSfM(n_points=31)`` takes the defaults, ``DeepNRSfM(Config(...))`` any setting. The
+    parameters carry the names of the paper: `D` (list of dictionaries), `encoder_threshold`,
+    `decoder_threshold`, `beta`, `gamma`, `output_bias`. `scale` is a buffer: the unit of length that
+    `fit` found, so that results come back in the user's units. The weights start Glorot-uniform as in
+    the authors' code, drawn from `generator`; thresholds and S̄ start at zero.
+    """
+
+    def __init__(self, config=None, *, n_points=None, generator=None):
+        super().__init__()
+        if config is None:
+            if n_points is None:
+                raise ValueError("DeepNRSfM needs n_points or a Config.")
+            config = Config(n_points)
+        self.config = config
+        P, K = config.n_points, config.widths
+        self.D = nn.ParameterList(
+            [nn.Parameter(torch.empty(K[0], P, 3))] + [nn.Parameter(torch.empty(a, b)) for a, b in pairwise(K)]
+        )
+        self.encoder_threshold = nn.ParameterList([nn.Parameter(torch.zeros(k)) for k in K])
+        self.decoder_threshold = nn.ParameterList([nn.Parameter(torch.zeros(k)) for k in K[:-1]])
+        self.beta = nn.Parameter(torch.empty(6 * K[-1], K[-1]) if config.beta == "full" else torch.empty(6))
+        self.gamma = nn.Parameter(torch.empty(K[-1]))
+        self.output_bias = nn.Parameter(torch.zeros(P, 3), requires_grad=config.output_bias)
+        self.register_buffer("scale", torch.ones(()))
+        self._draw_weights(generator)
+
+    def _draw_weights(self, generator):
+
+        def glorot(parameter, fan_in, fan_out):
+            limit = (6 / (fan_in + fan_out)) ** 0.5
+            nn.init.uniform_(parameter, -limit, limit, generator=generator)
+
+        glorot(self.D[0], 3 * self.config.first_atoms, 3 * self.config.n_points)
+        for D in list(self.D)[1:]:
+            glorot(D, *D.shape)
+        last = self.config.last_atoms
+        glorot(self.beta, 6 * last if self.config.beta == "full" else 6, last)
+        glorot(self.gamma, last, 1)
+
+    @property
+    def coherence(self):
+        """Mutual coherence of the last dictionary, a quality measure that needs no truth (chapter 10)."""
+        D = self.D[-1]
+        return mutual_coherence(D if D.ndim == 2 else D.flatten(1).T)
+
+    def encode(self, X):
+        """Block sparse code of normalised points: (B, P, 2) -> Psi_N (B, 2, 3, K_N).
+
+        One step of block ISTA per layer. The columns of a block come before its rows here, so that
+        every layer is one matrix product over the flattened batch (chapter 06).
+        """
+        B, P, _ = X.shape
+        D1 = self.D[0].permute(1, 2, 0).reshape(P, -1)  # (P, 3 K₁)
+        Z = X.mT.reshape(2 * B, P) @ D1  # (2B, 3 K₁)
+        Z = torch.relu(Z.view(6 * B, -1) - self.encoder_threshold[0])  # (6B, K₁)
+        for D, b in zip(list(self.D)[1:], list(self.encoder_threshold)[1:], strict=True):
+            Z = torch.relu(torch.addmm(-b, Z, D))  # (6B, K_i)
+        return Z.view(B, 2, 3, -1)
+
+    def bottleneck(self, Psi):
+        """Sparse code and camera of Psi_N (B, 2, 3, K): psi (B, K) and M (B, 3, 2), orthonormal."""
+        B, _, _, K = Psi.shape
+        full = self.config.beta == "full"
+        psi = Psi.reshape(B, 6 * K) @ self.beta if full else self.beta @ Psi.reshape(B, 6, K)
+        return psi, nearest_orthonormal((Psi @ self.gamma).mT)
+
+    def decode(self, psi):
+        """Shape of a sparse code, in normalised units: (B, K_N) -> (B, P, 3)."""
+        for D, b in zip(list(self.D)[:0:-1], list(self.decoder_threshold)[::-1], strict=True):
+            psi = torch.relu(torch.addmm(-b, psi, D.mT))  # (B, K_{i-1})
+        S = psi @ self.D[0].flatten(1)  # (B, 3P)
+        return S.view(-1, *self.output_bias.shape) + self.output_bias
+
+    def normalize(self, W, visible):
+        """Centred, scaled points with zeros where hidden; and each frame's scale (B,)."""
+        X, _ = preprocessing.center(W, visible)
+        if self.config.projection == "orthographic":
+            scale = self.scale.expand(len(X))
+        else:
+            scale = preprocessing.frame_scale(X, visible)
+        return X / scale[:, None, None], scale
+
+    def forward(self, W, visible=None):
+        """Shapes, cameras and translations of image points.
+
+        Parameters
+        ----------
+        W : (B, P, 2) tensor in image coordinates
+        visible : (B, P) bool tensor, optional
+
+        Returns
+        -------
+        S : (B, P, 3), centred over the points; M : (B, 3, 2); t : (B, 2)
+            In the units of W; ``S @ M + t[:, None]`` reprojects.
+        """
+        if visible is None:
+            visible = torch.ones(W.shape[:2], dtype=torch.bool, device=W.device)
+        X, scale = self.normalize(W, visible)
+        psi, M = self.bottleneck(self.encode(X))
+        S = self.decode(psi)
+        S = (S - S.mean(1, keepdim=True)) * scale[:, None, None]
+        t = preprocessing.visible_mean(W - S @ M, visible)  # the best t in closed form
+        return S, M, t
+
+    def to_arrays(self):
+        """(config, weights) as a dict and a dict of NumPy arrays: all that `from_arrays` needs."""
+        return asdict(self.config), {k: v.detach().cpu().numpy() for k, v in self.state_dict().items()}
+
+    @classmethod
+    def from_arrays(cls, config, weights):
+        """The network that `to_arrays` took apart."""
+        net = cls(Config(**config))
+        net.load_state_dict({k: torch.as_tensor(v) for k, v in weights.items()})
+        return net

@@ -1,0 +1,138 @@
+"""The front door: 2D landmarks in, 3D shapes and cameras out."""
+
+import numpy as np
+import torch
+
+from . import preprocessing
+from .cameras import nearest_orthonormal
+from .data import Landmarks, Reconstruction
+from .model import Config
+from .training import check_points, fit, use_threads
+
+_CHUNK = 4096  # frames per pass: memory stays flat in the number of frames
+_REFINE_STEPS = 150
+_REFINE_RATE = 0.07
+
+
+def reconstruct(
+    W,
+    visible=None,
+    model=None,
+    steps=None,
+    projection="orthographic",
+    refine=True,
+    seed=0,
+    device=None,
+    progress=True,
+    checkpoint=None,
+):
+    """3D shapes and cameras of 2D landmarks, without any 3D supervision.
+
+    Trains a network on the frames (or takes a trained one), infers every frame's code and camera,
+    and fits both to the frame's own points with the dictionaries held fixed.
+
+    Parameters
+    ----------
+    W : Landmarks, or (F, P, 2) array or tensor
+        Image points, in any unit; every frame shows the same P points in the same order.
+    visible : (F, P) bool, optional
+        False where a point is missing. Default: that of the Landmarks, else everything.
+    model : DeepNRSfM, optional
+        A trained network, for instance ``rec.model``: no training takes place.
+    steps : int, optional
+        Training steps. Default: those of the default schedule.
+    projection : "orthographic" or "weak_perspective"
+        One scale for all frames, or one per frame that goes into the shape.
+    refine : bool
+        Fit each frame's code and camera after the network's guess. False: one forward pass.
+    seed, device, progress, checkpoint
+        As in `fit`.
+
+    Returns
+    -------
+    Reconstruction in the units of W.
+
+    Raises
+    ------
+    ValueError
+        As `fit`; also if `model` was trained for another number of points or another projection.
+    """
+    names, edges = (), ()
+    if isinstance(W, Landmarks):
+        if W.points2d is None:
+            raise ValueError("these Landmarks have no points2d; photograph them with datasets.make_views first.")
+        names, edges = W.names, W.edges
+        W, visible = W.points2d, W.visible if visible is None else visible
+    W, visible = check_points(W, visible)
+    if model is None:
+        config = Config(n_points=W.shape[1], projection=projection)
+        model = fit(W, visible, config, steps=steps, seed=seed, device=device, progress=progress, checkpoint=checkpoint)
+    elif model.config.n_points != W.shape[1]:
+        raise ValueError(f"model was trained for {model.config.n_points} points, but W has {W.shape[1]}.")
+    elif model.config.projection != projection:
+        raise ValueError(f"model was trained for projection={model.config.projection!r}, not {projection!r}.")
+    with use_threads(1):  # as in `fit`: never slow on a busy machine, and the same result everywhere
+        parts = [infer(model, w, v, refine) for w, v in zip(W.split(_CHUNK), visible.split(_CHUNK), strict=True)]
+    S, M, t = (np.concatenate([part[i].numpy() for part in parts]) for i in range(3))
+    return Reconstruction(
+        shapes=S,
+        cameras=M,
+        translations=t,
+        visible=visible.numpy(),
+        names=names,
+        edges=edges,
+        coherence=model.coherence,
+        method="deep_nrsfm",
+        model=model,
+    )
+
+
+def infer(model, W, visible, refine=True):
+    """Shapes, cameras and translations of some frames by a trained network, in double precision at the end.
+
+    Parameters
+    ----------
+    model : DeepNRSfM
+    W, visible : tensors (B, P, 2) and (B, P) bool
+    refine : bool
+        After the network's guess, fit code and camera of each frame to its visible points by
+        gradient descent, dictionaries fixed: the encoder is one step of block ISTA per layer, and
+        this takes more of them.
+
+    Returns
+    -------
+    S (B, P, 3) centred, M (B, 3, 2), t (B, 2): tensors in the units of W.
+    """
+    X, scale = model.normalize(W, visible)
+    X = X.to(model.scale.dtype)
+    with torch.no_grad():
+        Psi = model.encode(X)
+        psi, M = model.bottleneck(Psi)
+    if refine:
+        psi, M = _refine(model, X, visible, psi, M)
+    with torch.no_grad():
+        S = model.decode(psi).double()
+        # A float32 camera is orthonormal to 1e-7; once more in double precision costs nothing.
+        M = nearest_orthonormal(M.double())
+    S = (S - S.mean(1, keepdim=True)) * scale[:, None, None].double()
+    t = preprocessing.visible_mean(W - S @ M, visible)
+    return S, M, t
+
+
+def _refine(model, X, visible, psi, M):
+    """Code (B, K) and camera (B, 3, 2) after Adam on each frame's reprojection error."""
+    weight = visible[..., None].to(X.dtype)
+    unit = psi.abs().mean().clamp(min=1e-6)  # codes live on the network's own scale
+    code, camera = (psi / unit).clone().requires_grad_(), M.clone().requires_grad_()
+    optimizer = torch.optim.Adam([code, camera], _REFINE_RATE)
+    for step in range(_REFINE_STEPS):
+        for group in optimizer.param_groups:
+            group["lr"] = _REFINE_RATE * (1 - step / _REFINE_STEPS)
+        S = model.decode(code * unit)
+        residual = (X - S @ nearest_orthonormal(camera)) * weight
+        # Each frame on its own: the sum's gradient for one frame does not see the others.
+        grads = torch.autograd.grad(residual.square().sum(), [code, camera])
+        code.grad, camera.grad = grads
+        optimizer.step()
+    with torch.no_grad():
+        return code * unit, nearest_orthonormal(camera)

@@ -1,0 +1,104 @@
+"""Landmarks and Reconstruction: their checks, their frames, their files."""
+
+import numpy as np
+import pytest
+
+import nrsfm_lite as nl
+
+
+@pytest.fixture
+def landmarks(rng):
+    return nl.Landmarks(
+        points2d=rng.normal(size=(6, 4, 2)), sequence=[0, 0, 1, 1, 2, 2], names="abcd", edges=[(0, 1), (1, 2)]
+    )
+
+
+def test_defaults(landmarks):
+    assert len(landmarks) == 6 and landmarks.n_points == 4
+    assert landmarks.visible.all() and landmarks.names == ("a", "b", "c", "d")
+
+
+def test_frames_by_slice_mask_and_number(landmarks):
+    assert len(landmarks[1:3]) == 2
+    assert len(landmarks[landmarks.sequence == 1]) == 2
+    np.testing.assert_array_equal(landmarks[5].points2d[0], landmarks.points2d[5])
+    assert landmarks[::2].names == landmarks.names
+
+
+def test_split_is_by_whole_sequences_and_takes_the_last(landmarks):
+    train, test = landmarks.split()
+    assert set(train.sequence) == {0, 1} and set(test.sequence) == {2}
+
+
+def test_split_of_one_sequence_is_refused(landmarks):
+    with pytest.raises(ValueError, match="sequences on both sides"):
+        landmarks[:2].split()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({}, "needs points2d"),
+        ({"points2d": np.zeros((3, 2))}, "three axes"),
+        ({"points2d": np.zeros((3, 4, 3))}, r"expected \(3, 4, 2\)"),
+        ({"points2d": np.zeros((3, 4, 2)), "visible": np.ones((3, 5))}, r"expected \(3, 4\)"),
+        ({"points2d": np.full((3, 4, 2), np.nan)}, "12 visible points"),
+        ({"points3d": np.full((3, 4, 3), np.inf)}, "not finite"),
+        ({"points2d": np.zeros((3, 4, 2)), "names": "abc"}, "3 entries for 4 points"),
+        ({"points2d": np.zeros((3, 4, 2)), "edges": [(0, 4)]}, "outside"),
+        ({"points2d": [[["a", "b"]]]}, "cannot be read as an array"),
+    ],
+)
+def test_wrong_landmarks_are_refused_by_name(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        nl.Landmarks(**wrong)
+
+
+def test_a_hidden_point_may_be_nan():
+    W = np.zeros((2, 4, 2))
+    W[0, 1] = np.nan
+    visible = np.isfinite(W).all(-1)
+    assert not nl.Landmarks(points2d=W, visible=visible).visible[0, 1]
+
+
+def test_landmarks_round_trip(landmarks, tmp_path):
+    landmarks.save(tmp_path / "walk.npz")
+    again = nl.datasets.load_npz(tmp_path / "walk.npz")
+    np.testing.assert_array_equal(again.points2d, landmarks.points2d)
+    np.testing.assert_array_equal(again.edges, landmarks.edges)
+    assert again.names == landmarks.names and again.name == landmarks.name and again.points3d is None
+
+
+def test_reconstruction_reprojects_as_promised(rng):
+    rec = nl.Reconstruction(rng.normal(size=(3, 5, 3)), nl.cameras.random_cameras(3), rng.normal(size=(3, 2)))
+    np.testing.assert_allclose(rec.projections, rec.shapes @ rec.cameras + rec.translations[:, None])
+
+
+def test_reconstruction_round_trip_with_its_network(rng, tmp_path):
+    net = nl.DeepNRSfM(nl.Config(5, n_dictionaries=3, first_atoms=8, last_atoms=3))
+    W = rng.normal(size=(4, 5, 2))
+    rec = nl.reconstruct(W, model=net)
+    rec.save(tmp_path / "walk")  # the ending is added
+    again = nl.Reconstruction.load(tmp_path / "walk.npz")
+    np.testing.assert_array_equal(again.shapes, rec.shapes)
+    assert (again.coherence, again.method, again.converged) == (rec.coherence, rec.method, rec.converged)
+    np.testing.assert_array_equal(nl.reconstruct(W, model=again.model).shapes, rec.shapes)
+
+
+def test_reconstruction_without_a_network(rng, tmp_path):
+    rec = nl.Reconstruction(rng.normal(size=(3, 5, 3)), nl.cameras.random_cameras(3), names="abcde")
+    rec.save(tmp_path / "r.npz")
+    again = nl.Reconstruction.load(tmp_path / "r.npz")
+    assert again.model is None and again.coherence is None and again.names == rec.names
+
+
+def test_wrong_reconstructions_are_refused(rng, landmarks, tmp_path):
+    with pytest.raises(ValueError, match="shapes has shape"):
+        nl.Reconstruction(np.zeros((3, 5, 2)), np.zeros((3, 3, 2)))
+    with pytest.raises(ValueError, match="cameras has shape"):
+        nl.Reconstruction(np.zeros((3, 5, 3)), np.zeros((2, 3, 2)))
+    landmarks.save(tmp_path / "l.npz")
+    with pytest.raises(ValueError, match="not a saved reconstruction"):
+        nl.Reconstruction.load(tmp_path / "l.npz")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        nl.Reconstruction.load(tmp_path / "none.npz")

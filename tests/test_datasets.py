@@ -1,0 +1,181 @@
+"""Generated motion, views of it, and a user's own files."""
+
+import numpy as np
+import pytest
+
+import nrsfm_lite as nl
+from nrsfm_lite import datasets
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return datasets.make_motion(400, seed=1)
+
+
+def test_motion_is_a_body_of_31_points(motion):
+    assert motion.points3d.shape == (400, 31, 3) and len(motion.edges) == 30
+    assert len(datasets.ACTIONS) >= 8 and set(motion.sequence) == {0, 1}
+
+
+def test_bones_keep_their_lengths_within_a_subject_and_differ_between(motion):
+    bones = motion.points3d[:, motion.edges[:, 1]] - motion.points3d[:, motion.edges[:, 0]]
+    lengths = np.linalg.norm(bones, axis=2)
+    first, second = lengths[motion.sequence == 0], lengths[motion.sequence == 1]
+    np.testing.assert_allclose(first.std(0), 0, atol=1e-12)
+    assert np.abs(first[0] / second[0] - 1).max() > 0.02
+
+
+@pytest.mark.parametrize("action", datasets.ACTIONS)
+def test_every_action_looks_like_a_person(action):
+    data = datasets.make_motion(200, seed=0, actions=[action])
+    S, at = data.points3d, {name: i for i, name in enumerate(data.names)}
+    assert S[..., 1].min() >= -1e-9, "nothing goes through the floor"
+    assert np.linalg.norm(np.diff(S, axis=0), axis=2).max() < 0.6, "nothing jumps more than 0.6 m in 1/30 s"
+    # Knees bend forward: seen in the thigh's own plane, the ankle is never in front of the straight leg.
+    forward = S[:, at["left_toe"]] - S[:, at["left_ankle"]]
+    for side in ("left_", "right_"):
+        thigh = S[:, at[side + "knee"]] - S[:, at[side + "thigh"]]
+        shin = S[:, at[side + "ankle"]] - S[:, at[side + "knee"]]
+        bend = np.degrees(
+            np.arccos((thigh * shin).sum(1) / np.linalg.norm(thigh, axis=1) / np.linalg.norm(shin, axis=1))
+        )
+        assert bend.max() < 160
+    assert np.isfinite(forward).all()
+    assert (S[:, at["head"], 1] > S[:, at["left_ankle"], 1] + 0.2).mean() > 0.9
+
+
+def test_left_and_right_are_mirror_images_in_the_rest_pose():
+    from nrsfm_lite.datasets import motion
+
+    lefts = [i for i, n in enumerate(motion.NAMES) if n.startswith("left_")]
+    for i in lefts:
+        other = motion._MIRROR[i]
+        assert motion.NAMES[other] == motion.NAMES[i].replace("left_", "right_")
+        np.testing.assert_allclose(motion._OFFSETS[other], motion._OFFSETS[i] * (-1, 1, 1))
+        np.testing.assert_allclose(motion._REST[other], motion._REST[i] * (1, -1, -1))
+
+
+def test_motion_is_repeatable_and_seeds_differ(motion):
+    np.testing.assert_array_equal(datasets.make_motion(400, seed=1).points3d, motion.points3d)
+    assert not np.array_equal(datasets.make_motion(400, seed=2).points3d, motion.points3d)
+
+
+def rank99(S):
+    """How many principal components hold 99 % of the variance, each shape turned onto the mean one."""
+    mean = S[0]
+    for _ in range(5):
+        A, _ = nl.metrics.align(S, np.broadcast_to(mean, S.shape), scale=False, reflections=False)
+        mean = A.mean(0)
+    energy = np.linalg.svd((A - mean).reshape(len(A), -1), compute_uv=False) ** 2
+    return int(np.searchsorted(np.cumsum(energy) / energy.sum(), 0.99) + 1)
+
+
+def rigid_error(data):
+    views = datasets.make_views(data, seed=0)
+    return nl.metrics.normalized_error(nl.baselines.tomasi_kanade(views).shapes, data.points3d).mean()
+
+
+def test_generated_motion_is_no_easier_than_motion_capture(real_data):
+    """At least 80 % of the rank and of the rigid error of the CMU martial-arts files."""
+    folder = real_data / "cmu_bvh" / "martial"
+    if not folder.exists():
+        pytest.skip("the CMU motions are not in NRSFM_DATA")
+    real = datasets.load_bvh(folder, joints=datasets.CMU_BODY, every=4)
+    made = datasets.make_motion(4000, seed=0)
+    assert rank99(made.points3d) >= 0.8 * rank99(real.points3d)
+    assert rigid_error(made) >= 0.8 * rigid_error(real)
+
+
+def test_motion_refuses(motion):
+    with pytest.raises(ValueError, match="n_frames=0"):
+        datasets.make_motion(0)
+    with pytest.raises(KeyError, match="unknown action 'swim'"):
+        datasets.make_motion(10, actions=["walk", "swim"])
+
+
+def test_views_are_projections_of_the_truth(motion):
+    views = datasets.make_views(motion, seed=4)
+    np.testing.assert_allclose(nl.cameras.project(views.points3d, views.cameras, views.translations), views.points2d)
+    np.testing.assert_allclose(views.points2d.mean(1), 0, atol=1e-12)
+    np.testing.assert_array_equal(views.points2d, datasets.make_views(motion, seed=4).points2d)
+    assert motion.points2d is None, "the motion itself is untouched"
+
+
+def test_weak_perspective_views_have_scale_and_translation(motion):
+    views = datasets.make_views(motion, projection="weak_perspective", scale_range=(1, 3), translation_range=2.0)
+    np.testing.assert_allclose(nl.cameras.project(views.points3d, views.cameras, views.translations), views.points2d)
+    S = motion.points3d - motion.points3d.mean(1, keepdims=True)
+    scale = np.linalg.norm(views.points3d, axis=(1, 2)) / np.linalg.norm(S, axis=(1, 2))
+    assert scale.min() < 1.1 and scale.max() > 2.9 and np.ptp(views.translations) > 1
+
+
+def test_noise_has_the_ratio_asked_for_and_leaves_the_cameras(motion):
+    clean, noisy = datasets.make_views(motion), datasets.make_views(motion, noise=0.2)
+    np.testing.assert_array_equal(clean.cameras, noisy.cameras)
+    ratio = np.linalg.norm(noisy.points2d - clean.points2d, axis=(1, 2)) / np.linalg.norm(clean.points2d, axis=(1, 2))
+    np.testing.assert_allclose(ratio, 0.2)
+
+
+def test_missing_by_number_and_by_share(motion):
+    few = datasets.make_views(motion, missing=7)
+    hidden = (~few.visible).sum(1)
+    assert set(hidden) == set(range(1, 8)), "an int m hides 1 … m"
+    assert np.isnan(few.points2d[~few.visible]).all()
+    assert set((~datasets.make_views(motion, missing=0.3).visible).sum(1)) == {round(0.3 * 31)}
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"projection": "fisheye"}, "projection='fisheye'"),
+        ({"scale_range": (1, 2)}, "no meaning for orthographic"),
+        ({"projection": "weak_perspective", "scale_range": (2, 1)}, "0 < low <= high"),
+        ({"noise": -1}, "noise=-1"),
+        ({"missing": 31}, "hides 31 of 31"),
+        ({"missing": "many"}, "missing='many'"),
+    ],
+)
+def test_views_refuse(motion, more, message):
+    with pytest.raises(ValueError, match=message):
+        datasets.make_views(motion, **more)
+
+
+def test_views_need_3d(rng):
+    with pytest.raises(ValueError, match="needs Landmarks with points3d"):
+        datasets.make_views(nl.Landmarks(points2d=rng.normal(size=(3, 4, 2))))
+
+
+def test_npz_of_a_user(rng, tmp_path):
+    W = rng.normal(size=(3, 4, 2))
+    np.savez(tmp_path / "mine.npz", W=W, other=np.arange(3))
+    data = datasets.load_npz(tmp_path / "mine.npz")
+    np.testing.assert_array_equal(data.points2d, W)
+    assert data.name == "mine" and data.names[0] == "point_0"
+    np.savez(tmp_path / "shape.npz", S=rng.normal(size=(3, 4, 3)))
+    assert datasets.load_npz(tmp_path / "shape.npz").points3d.shape == (3, 4, 3)
+
+
+def test_npz_refuses(rng, tmp_path):
+    file = tmp_path / "f.npz"
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        datasets.load_npz(file)
+    file.write_bytes(b"")
+    with pytest.raises(ValueError, match="the file is empty"):
+        datasets.load_npz(file)
+    file.write_text("hello")
+    with pytest.raises(ValueError, match=r"not an \.npz file"):
+        datasets.load_npz(file)
+    np.savez(file, points2d=rng.normal(size=(30, 40, 2)))
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ValueError, match=r"truncated|could not be read"):
+        datasets.load_npz(file)
+    np.savez(file, x=np.zeros(3))
+    with pytest.raises(KeyError, match="it has x"):
+        datasets.load_npz(file)
+    np.savez(file, points2d=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(ValueError, match="could not be read"):
+        datasets.load_npz(file)
+    np.savez(file, points2d=np.full((3, 4, 2), np.nan))
+    with pytest.raises(ValueError, match=r"f\.npz: points2d has 12 visible points"):
+        datasets.load_npz(file)

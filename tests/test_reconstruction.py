@@ -1,0 +1,84 @@
+"""The front door: from points to a Reconstruction, and back to the points."""
+
+import numpy as np
+import pytest
+import torch
+
+import nrsfm_lite as nl
+
+
+@pytest.fixture(scope="module")
+def views():
+    return nl.datasets.make_views(nl.datasets.make_motion(600, seed=7), seed=7)
+
+
+@pytest.fixture(scope="module")
+def rec(views):
+    return nl.reconstruct(views, steps=400, progress=False)
+
+
+def test_beats_rigid_factorisation_even_when_trained_briefly(views, rec):
+    ours = nl.metrics.normalized_error(rec.shapes, views.points3d).mean()
+    rigid = nl.metrics.normalized_error(nl.baselines.tomasi_kanade(views).shapes, views.points3d).mean()
+    assert ours < rigid
+
+
+def test_keeps_its_promises(views, rec):
+    np.testing.assert_allclose(
+        rec.cameras.swapaxes(1, 2) @ rec.cameras, np.broadcast_to(np.eye(2), (600, 2, 2)), atol=1e-9
+    )
+    np.testing.assert_allclose(rec.shapes.mean(1), 0, atol=1e-9)
+    np.testing.assert_allclose(rec.projections.mean(1), views.points2d.mean(1), atol=1e-9)
+    assert rec.names == views.names and rec.method == "deep_nrsfm" and rec.converged
+    assert 0 <= rec.coherence <= 1 and not rec.model.training
+
+
+def test_units_of_the_user(views):
+    pixels = 200 * views.points2d + (640, 360)
+    few, other = (nl.reconstruct(W, steps=5, refine=False, progress=False) for W in (views, pixels))
+    np.testing.assert_allclose(other.shapes, 200 * few.shapes, rtol=0.05, atol=0.5)
+    np.testing.assert_allclose(other.translations, [[640, 360]] * 600, atol=1e-6)
+
+
+def test_refinement_explains_the_images_better(views, rec):
+    def residual(r):
+        return np.linalg.norm(r.projections - views.points2d)
+
+    plain = nl.reconstruct(views, model=rec.model, refine=False)
+    assert residual(rec) < residual(plain)
+    S, M, _ = rec.model(torch.as_tensor(views.points2d).float())
+    np.testing.assert_allclose(plain.shapes, S.detach(), atol=1e-4)
+    np.testing.assert_allclose(plain.cameras, M.detach(), atol=1e-4)
+
+
+def test_a_trained_network_takes_new_frames_of_any_number(rec):
+    other = nl.datasets.make_views(nl.datasets.make_motion(50, seed=99))
+    again = nl.reconstruct(other, model=rec.model)
+    one = nl.reconstruct(other.points2d[:1], model=rec.model)
+    np.testing.assert_allclose(one.shapes[0], again.shapes[0], rtol=0.02, atol=0.02)
+
+
+def test_tensors_and_hidden_points(views, rec):
+    visible = np.ones((600, 31), bool)
+    visible[:, 3] = False
+    W = torch.as_tensor(np.where(visible[..., None], views.points2d, np.nan))
+    other = nl.reconstruct(W, visible=torch.as_tensor(visible), model=rec.model, refine=False)
+    assert np.isfinite(other.shapes).all() and not other.visible[:, 3].any()
+
+
+def test_weak_perspective_scale_goes_into_the_shape(views):
+    scale = np.linspace(1, 4, 600)[:, None, None]
+    rec = nl.reconstruct(views.points2d * scale, projection="weak_perspective", steps=200, progress=False)
+    size = np.linalg.norm(rec.shapes, axis=(1, 2))
+    assert size[-100:].mean() > 2 * size[:100].mean()
+
+
+def test_wrong_input_is_refused(views, rec):
+    with pytest.raises(ValueError, match="no points2d"):
+        nl.reconstruct(nl.datasets.make_motion(20))
+    with pytest.raises(ValueError, match="at least 10 frames"):
+        nl.reconstruct(views.points2d[:2], progress=False)
+    with pytest.raises(ValueError, match="model was trained for 31 points, but W has 30"):
+        nl.reconstruct(views.points2d[:, :30], model=rec.model)
+    with pytest.raises(ValueError, match="projection='orthographic', not 'weak_perspective'"):
+        nl.reconstruct(views, model=rec.model, projection="weak_perspective")

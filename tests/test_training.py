@@ -1,0 +1,144 @@
+"""Training: it learns, it repeats itself, it resumes, and it never turns NaN."""
+
+import numpy as np
+import pytest
+import torch
+
+import nrsfm_lite as nl
+from nrsfm_lite import training
+
+SMALL = nl.Config(6, n_dictionaries=3, first_atoms=16, last_atoms=4)
+
+
+@pytest.fixture(scope="module")
+def views():
+    """A bending tetrahedron with two loose points."""
+    rng = np.random.default_rng(0)
+    S = rng.normal(size=(6, 3)) + 0.3 * rng.normal(size=(200, 1, 1)) * rng.normal(size=(6, 3))
+    return nl.datasets.make_views(nl.Landmarks(points3d=S))
+
+
+def reprojection(net, W):
+    W = torch.as_tensor(W).float()
+    with torch.no_grad():
+        S, M, t = net(W)
+    residual = (W - S @ M - t[:, None]).flatten(1).norm(dim=1)
+    return float((residual / (W - W.mean(1, keepdim=True)).flatten(1).norm(dim=1)).mean())
+
+
+@pytest.mark.parametrize("schedule", ["default", "original"])
+def test_the_loss_falls(views, schedule):
+    few, many = (nl.fit(views.points2d, None, SMALL, schedule, steps=n, progress=False) for n in (1, 300))
+    assert reprojection(many, views.points2d) < 0.5 * reprojection(few, views.points2d)
+
+
+def test_same_seed_same_weights_and_no_global_state_touched(views):
+    threads, state = torch.get_num_threads(), torch.get_rng_state()
+    a, b, c = (nl.fit(views.points2d, None, SMALL, steps=20, seed=s, progress=False) for s in (0, 0, 1))
+    assert torch.equal(torch.get_rng_state(), state) and torch.get_num_threads() == threads
+    assert torch.equal(a.D[0], b.D[0]) and not torch.equal(a.D[0], c.D[0])
+
+
+@pytest.mark.parametrize("schedule", ["default", "original"])
+def test_interrupted_training_resumes_to_the_same_result(views, schedule, tmp_path, monkeypatch):
+    def train(**more):
+        return nl.fit(views.points2d, None, SMALL, schedule, steps=40, progress=False, **more)
+
+    whole = train()
+    monkeypatch.setattr(training, "_CHECKPOINT_EVERY", 15)
+    loss, calls = training._loss, iter(range(25))
+
+    def interrupted(*inputs):
+        if next(calls, None) is None:
+            raise KeyboardInterrupt
+        return loss(*inputs)
+
+    monkeypatch.setattr(training, "_loss", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train(checkpoint=tmp_path / "state.pt")
+    monkeypatch.setattr(training, "_loss", loss)
+    resumed = train(checkpoint=tmp_path / "state.pt")
+    for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
+        assert torch.equal(a, b)
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_a_finished_checkpoint_trains_no_more(views, tmp_path, monkeypatch):
+    train = {"steps": 10, "progress": False, "checkpoint": tmp_path / "state.pt"}
+    first = nl.fit(views.points2d, None, SMALL, **train)
+    monkeypatch.setattr(training, "_loss", None)  # would raise if called
+    again = nl.fit(views.points2d, None, SMALL, **train)
+    assert torch.equal(first.D[0], again.D[0])
+
+
+def test_a_checkpoint_of_other_settings_is_refused(views, tmp_path):
+    train = {"steps": 5, "progress": False, "checkpoint": tmp_path / "state.pt"}
+    nl.fit(views.points2d, None, SMALL, seed=0, **train)
+    with pytest.raises(ValueError, match="other data or settings"):
+        nl.fit(views.points2d, None, SMALL, seed=1, **train)
+    (tmp_path / "state.pt").write_bytes(b"PK\x03\x04 not a checkpoint")
+    with pytest.raises(ValueError, match="broken"):
+        nl.fit(views.points2d, None, SMALL, seed=0, **train)
+
+
+def test_degenerate_frames_do_not_turn_the_loss_nan():
+    """All points of a frame on one line: its best camera block has rank one."""
+    rng = np.random.default_rng(0)
+    W = rng.normal(size=(40, 6, 2))
+    W[::2] = W[::2, :, :1] * (1.0, 2.0)
+    net = nl.fit(W, None, SMALL, steps=200, progress=False)
+    assert all(torch.isfinite(p).all() for p in net.parameters())
+    assert np.isfinite(reprojection(net, W))
+
+
+def test_a_nonfinite_gradient_costs_a_step_not_the_run(views, monkeypatch):
+    loss, calls = training._loss, iter([False] * 5 + [True] + [False] * 20)
+
+    def sometimes_infinite(net, *inputs):
+        value = loss(net, *inputs)
+        return value * torch.inf if next(calls) else value
+
+    monkeypatch.setattr(training, "_loss", sometimes_infinite)
+    net = nl.fit(views.points2d, None, SMALL, steps=20, progress=False)
+    assert all(torch.isfinite(p).all() for p in net.parameters())
+
+
+def test_hidden_points_do_not_change_the_result(views):
+    visible = np.ones((200, 6), bool)
+    visible[::3, 2] = False
+    a, b = np.where(visible[..., None], views.points2d, 7.0), np.where(visible[..., None], views.points2d, np.nan)
+    nets = [nl.fit(W, visible, SMALL, steps=10, progress=False) for W in (a, b)]
+    assert torch.equal(nets[0].D[0], nets[1].D[0])
+
+
+def dead_frame():
+    visible = np.ones((20, 6), bool)
+    visible[7] = False
+    return visible
+
+
+def one_place():
+    W = np.random.default_rng(0).normal(size=(20, 6, 2))
+    W[3] = 5.0
+    return W
+
+
+@pytest.mark.parametrize(
+    ("W", "more", "message"),
+    [
+        (np.zeros((20, 6, 3)), {}, r"expected \(F, P, 2\)"),
+        (np.full((20, 6, 2), np.nan), {}, "visible points that are NaN"),
+        (np.ones((20, 6, 2)), {"visible": np.ones((20, 5))}, r"visible has shape \(20, 5\)"),
+        (np.ones((20, 6, 2)), {"visible": dead_frame()}, "frame 7 of W has no visible point"),
+        (np.ones((20, 6, 2)), {}, "no shape to see"),
+        (one_place(), {}, "frame 3 of W has all its visible points at one place"),
+        (np.ones((2, 6, 2)), {}, "at least 10 frames and 4 points; got 2 frames of 6 points"),
+        (np.ones((20, 3, 2)), {}, "got 20 frames of 3 points"),
+        (np.ones((20, 6, 2)), {"config": nl.Config(5)}, "config.n_points is 5"),
+        (np.ones((20, 6, 2)), {"schedule": "fast"}, "schedule='fast'"),
+        (np.ones((20, 6, 2)), {"steps": 0}, "steps=0"),
+    ],
+)
+def test_wrong_input_is_refused(W, more, message):
+    with pytest.raises(ValueError, match=message):
+        nl.fit(W, progress=False, **more)
