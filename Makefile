@@ -2,7 +2,6 @@
 PY ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
-export TQDM_DISABLE := 1
 
 help:            ## list the targets
 	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 10
@@ -20,7 +19,7 @@ test: $(READY)   ## check the style, test the package, execute every notebook on
 
 lab: $(READY)    ## open the notebooks in JupyterLab
 	@echo "Opening JupyterLab …"
-	@TQDM_DISABLE= $(BIN)/jupyter lab notebooks
+	@$(BIN)/jupyter lab notebooks
 
 bench: $(READY)  ## time a training step and inference on this machine
 	@echo "Timing …"

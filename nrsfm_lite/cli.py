@@ -77,7 +77,7 @@ def _reconstruct(arguments):
         flips = metrics.handedness(rec.shapes, data.points3d)
         print(f"mean normalised 3D error: {error:.4f} (per frame up to rotation, mirror and scale)")
         print(f"frames of the other handedness: {flips:.1%}")
-    print(f"coherence of the last dictionary: {rec.coherence:.3f} (lower is better)")
+    print(f"coherence of the last dictionary: {rec.coherence:.3f}")
     if arguments.save:
         rec.save(arguments.save)
         print(f"wrote {arguments.save}")

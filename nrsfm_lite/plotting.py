@@ -11,7 +11,24 @@ from .metrics import align
 
 # Readable on white and on black, and for readers who do not tell red from green.
 PREDICTED, TRUE, SEEN = "#e8702a", "#7f8fa6", "#2a9d8f"
+INK = "#767676"  # text and axes
 _PREDICTED_NAME, _TRUE_NAME = "reconstruction", "truth"
+
+
+def use_style():
+    """Matplotlib's settings of the book: transparent, without clutter, readable on white and on black."""
+    plt.rcParams.update(
+        {
+            **{f"{part}.facecolor": "none" for part in ("figure", "axes", "savefig", "legend")},
+            **{key: INK for key in ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")},
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.prop_cycle": plt.cycler(color=[PREDICTED, TRUE, SEEN, "#8a63d2", "#d1495b"]),
+            "legend.frameon": False,
+            "figure.dpi": 110,
+            "font.size": 10,
+        }
+    )
 
 
 def show3d(shapes, truth=None, edges=None, *, max_frames=60, up=None, title=None, height=520):
@@ -100,7 +117,7 @@ def show2d(W, edges=None, frames=None, *, visible=None, columns=6):
         _draw2d(axis, W[f], edges, SEEN)
         axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", xticks=[], yticks=[])
         axis.set_title(f"frame {f}", fontsize=9)
-        axis.spines[:].set_color(TRUE)
+        axis.spines[:].set(color=TRUE, visible=True)
     return figure
 
 
@@ -130,7 +147,7 @@ def compare(rec, truth, frames=None, *, columns=5):
     size = (1.9 * len(frames), 1.8 * len(rows))
     figure, axes = plt.subplots(len(rows), len(frames), figsize=size, layout="constrained", squeeze=False)
     for line, (title, layers) in zip(axes, rows.items(), strict=True):
-        line[0].set_ylabel(title, color=TRUE)
+        line[0].set_ylabel(title, color=INK)
         for i, axis in enumerate(line):
             for points, colour in layers:
                 _draw2d(axis, points[i], truth.edges, colour)
@@ -222,7 +239,7 @@ def _body(points, edges, colour, name):
 def _stage(figure, reach, frames, title, height, legend):
     """Axes, camera, slider and play button."""
     axis = dict(range=[-reach, reach], showbackground=False, showticklabels=False, title="",
-                gridcolor="rgba(127,127,127,.25)", zerolinecolor="rgba(127,127,127,.25)", showspikes=False)  # fmt: skip
+                gridcolor="#9a9a9a", gridwidth=1, zerolinecolor="#9a9a9a", nticks=5, showspikes=False)  # fmt: skip
     still = dict(mode="immediate", frame=dict(duration=0, redraw=True), transition=dict(duration=0))
     moving = dict(fromcurrent=True, frame=dict(duration=60, redraw=True), transition=dict(duration=0))
     control = dict(bgcolor="rgba(127,127,127,.15)", bordercolor="rgba(127,127,127,.4)")
@@ -236,16 +253,16 @@ def _stage(figure, reach, frames, title, height, legend):
         height=height,
         margin=dict(l=0, r=0, t=40 if title else 10, b=10),
         paper_bgcolor="rgba(0,0,0,0)",
-        font_color="#7f7f7f",
+        font_color=INK,
         showlegend=legend,
         legend=dict(orientation="h", x=0.5, xanchor="center", y=1.0, bgcolor="rgba(0,0,0,0)"),
         scene=dict(
-            aspectmode="cube", xaxis=axis, yaxis=axis, zaxis=axis, camera_eye=dict(x=1.1, y=-1.35, z=0.45)
+            aspectmode="cube", xaxis=axis, yaxis=axis, zaxis=axis, camera_eye=dict(x=0.8, y=-1.0, z=0.3)
         ),
         updatemenus=[dict(type="buttons", direction="left", showactive=False, buttons=buttons, x=0, y=0,
                           xanchor="left", yanchor="top", pad=dict(t=22, l=8), **control)] if many else [],
-        sliders=[dict(x=0.16, len=0.82, y=0, pad=dict(t=8, b=8), tickcolor="rgba(0,0,0,0)", font_color="rgba(0,0,0,0)",
-                      currentvalue=dict(prefix="frame ", font=dict(color="#7f7f7f")),
+        sliders=[dict(x=0.26, len=0.72, y=0, pad=dict(t=8, b=8), tickcolor="rgba(0,0,0,0)", font_color="rgba(0,0,0,0)",
+                      currentvalue=dict(prefix="frame ", font=dict(color=INK)),
                       steps=[dict(label=f, method="animate", args=[[f], still]) for f in frames], **control)]
         if many else [],
     )  # fmt: skip

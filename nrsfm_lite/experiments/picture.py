@@ -17,7 +17,8 @@ def main(path):
     # One frame from each fifth of the film: the one whose error is nearest to the film's median.
     parts = np.array_split(np.arange(len(error)), 5)
     frames = [part[np.abs(error[part] - np.median(error)).argmin()] for part in parts]
-    plotting.compare(rec, views, frames).savefig(path, dpi=90, transparent=True)
+    plotting.use_style()
+    plotting.compare(rec, views, frames).savefig(path, dpi=90)
 
 
 if __name__ == "__main__":
