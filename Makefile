@@ -2,12 +2,15 @@
 PY ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+CACHE := _build/.jupyter_cache
 
 help:            ## list the targets
 	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 10
 
 book: $(READY)   ## build the book into _build/html; runs only notebooks that `make test` has not
 	@echo "Building the book …"
+	@# The cache knows the notebooks' cells only: with another package its outputs are stale.
+	@if [ -n "$$(find nrsfm_lite requirements.txt -newer $(CACHE)/global.db -not -name '*.pyc' -type f 2>/dev/null)" ]; then rm -rf $(CACHE); fi
 	@$(BIN)/jupyter-book build . --toc book/_toc.yml --quiet -W --keep-going --all
 	@echo "Open _build/html/index.html"
 
@@ -34,7 +37,7 @@ picture: $(READY) ## remake book/_static/reconstruction.png, the picture of the 
 
 clean:           ## remove the environment and everything built
 	@echo "Removing .venv and _build …"
-	@rm -rf .venv _build build *.egg-info
+	@rm -rf .venv _build build *.egg-info book/_ext/*.egg-info book/_ext/build .pytest_cache .ruff_cache
 
 $(READY): requirements.txt pyproject.toml book/_ext/pyproject.toml
 	@$(PY) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"Python 3.11 or newer is needed, this is {v[0]}.{v[1]}; try: make PY=python3.11")'

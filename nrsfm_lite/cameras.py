@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-# A 3×2 block whose second singular value is below this share of its squared norm has no direction
-# to offer for the second column: the nearest camera is not unique and its gradient has no bound.
+# A 3×2 block with σ₁ σ₂ below this share of ‖A‖² has no direction to offer for the second column:
+# the nearest camera is not unique there, and close by its gradient has no bound.
 _DEGENERATE = 1e-6
 
 

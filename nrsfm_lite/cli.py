@@ -16,7 +16,7 @@ def main(argv=None):
     arguments = _parser().parse_args(argv)
     try:
         arguments.run(arguments)
-    except (ValueError, OSError, KeyError) as error:
+    except (ValueError, OSError, KeyError, FloatingPointError) as error:
         # A KeyError prints its message in quotes; its first argument is the sentence itself.
         sentence = error.args[0] if isinstance(error, KeyError) else error
         print(f"nrsfm: {sentence}", file=sys.stderr)
@@ -60,9 +60,7 @@ def _parser():
 
 
 def _reconstruct(arguments):
-    for target in (arguments.out, arguments.save):
-        if target is not None and not target.parent.is_dir():
-            raise FileNotFoundError(f"{target.parent}: no such folder to write {target.name} to.")
+    _check_targets(arguments.out, arguments.save, arguments.checkpoint)
     data = _load(arguments)
     if data.points2d is None:
         data = datasets.make_views(data, seed=arguments.seed)
@@ -79,13 +77,21 @@ def _reconstruct(arguments):
         print(f"frames of the other handedness: {flips:.1%}")
     print(f"coherence of the last dictionary: {rec.coherence:.3f}")
     if arguments.save:
-        rec.save(arguments.save)
-        print(f"wrote {arguments.save}")
+        print(f"wrote {rec.save(arguments.save)}")
     if arguments.out:
         truth = data.points3d
         figure = plotting.show3d(rec, truth=truth, max_frames=150, title=arguments.file.name, height=700)
         plotting.write_html(figure, arguments.out)
         print(f"wrote {arguments.out}")
+
+
+def _check_targets(*targets):
+    """Find out before the training, not after it, that a result cannot be written."""
+    for target in targets:
+        if target is not None and not target.parent.is_dir():
+            raise FileNotFoundError(f"{target.parent}: no such folder to write {target.name} to.")
+        if target is not None and target.is_dir():
+            raise ValueError(f"{target}: is a folder; expected the name of a file to write.")
 
 
 def _load(arguments):
@@ -96,11 +102,13 @@ def _load(arguments):
     if kind == "auto":
         kind = "bvh" if file.is_dir() else file.suffix.lower().removeprefix(".")
     if kind == "npz":
+        if arguments.joints is not None or arguments.every != 1:
+            raise ValueError("--joints and --every are for .bvh files; points in an .npz are taken as they are.")
         return datasets.load_npz(file)
     if kind == "bvh":
         joints = arguments.joints
         if joints is not None:
-            joints = datasets.CMU_BODY if joints == "cmu" else joints.split(",")
+            joints = datasets.CMU_BODY if joints == "cmu" else [joint.strip() for joint in joints.split(",")]
         return datasets.load_bvh(file, joints=joints, every=arguments.every)
     if file.stat().st_size == 0:
         raise ValueError(f"{file}: the file is empty.")
@@ -108,6 +116,7 @@ def _load(arguments):
 
 
 def _view(arguments):
+    _check_targets(arguments.out)
     rec = Reconstruction.load(arguments.file)
     figure = plotting.show3d(rec, max_frames=150, title=arguments.file.name, height=700)
     plotting.write_html(figure, arguments.out)

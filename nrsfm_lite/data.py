@@ -23,7 +23,7 @@ _FRAME_ARRAYS = {
 }
 
 
-@dataclass
+@dataclass(eq=False)
 class Landmarks:
     """2D landmarks of F frames with P points each, and the truth where it is known.
 
@@ -88,12 +88,7 @@ class Landmarks:
             check_visible_finite("points2d", self.points2d, self.visible)
         if self.points3d is not None and not np.isfinite(self.points3d).all():
             raise ValueError("points3d has values that are not finite numbers.")
-        self.names = tuple(str(n) for n in self.names) or tuple(f"point_{i}" for i in range(n_points))
-        if len(self.names) != n_points:
-            raise ValueError(f"names has {len(self.names)} entries for {n_points} points.")
-        self.edges = np.asarray(self.edges, int).reshape(-1, 2)
-        if self.edges.size and not (self.edges.min() >= 0 and self.edges.max() < n_points):
-            raise ValueError(f"edges refers to a point outside 0 … {n_points - 1}.")
+        self.names, self.edges = _names_and_edges(self.names, self.edges, n_points)
 
     def __len__(self):
         return len(self.visible)
@@ -123,14 +118,14 @@ class Landmarks:
         return self[~unseen], self[unseen]
 
     def save(self, path):
-        """Write an .npz that `datasets.load_npz` reads."""
+        """Write an .npz that `datasets.load_npz` reads; returns its path (the ending is added if missing)."""
         arrays = {key: getattr(self, key) for key in _FRAME_ARRAYS if getattr(self, key) is not None}
-        np.savez_compressed(
-            _npz(path), names=np.array(self.names), edges=self.edges, name=np.array(self.name), **arrays
-        )
+        path = _npz(path)
+        np.savez_compressed(path, names=np.array(self.names), edges=self.edges, name=np.array(self.name), **arrays)
+        return path
 
 
-@dataclass
+@dataclass(eq=False)
 class Reconstruction:
     """What a method made of F frames: ``projections == shapes @ cameras + translations[:, None]``.
 
@@ -150,7 +145,8 @@ class Reconstruction:
         Mutual coherence of the last dictionary (chapter 10); None for methods without one.
     method : str
     converged : bool
-        False if the method was stopped before it was done.
+        False if an iterative method was stopped by a limit before it was done. A network is trained
+        for a given number of steps and is always done.
     model : DeepNRSfM or None
         The trained network, to be used again on new frames.
     """
@@ -184,8 +180,7 @@ class Reconstruction:
             if value.shape != expected:
                 raise ValueError(f"{key} has shape {value.shape}; expected {expected}.")
             setattr(self, key, value)
-        self.names = tuple(str(n) for n in self.names)
-        self.edges = np.asarray(self.edges, int).reshape(-1, 2)
+        self.names, self.edges = _names_and_edges(self.names, self.edges, n_points)
 
     def __len__(self):
         return len(self.shapes)
@@ -196,7 +191,7 @@ class Reconstruction:
         return self.shapes @ self.cameras + self.translations[:, None]
 
     def save(self, path):
-        """Write everything, the network's weights included, to one .npz without pickle."""
+        """Write everything, the network's weights included, to one .npz without pickle; returns its path."""
         arrays = {}
         if self.model is not None:
             config, weights = self.model.to_arrays()
@@ -205,7 +200,9 @@ class Reconstruction:
             value = getattr(self, f.name)
             if f.name != "model" and value is not None:
                 arrays[f.name] = np.array(value)
-        np.savez_compressed(_npz(path), **arrays)
+        path = _npz(path)
+        np.savez_compressed(path, **arrays)
+        return path
 
     @classmethod
     def load(cls, path):
@@ -213,6 +210,7 @@ class Reconstruction:
 
         Raises FileNotFoundError if there is no such file, ValueError if it is not a reconstruction.
         """
+        path = Path(path) if Path(path).is_file() else _npz(path)
         arrays = read_npz(path)
         if not {"shapes", "cameras"} <= arrays.keys():
             raise ValueError(f"{path}: not a saved reconstruction (it has {', '.join(sorted(arrays)) or 'nothing'}).")
@@ -226,8 +224,51 @@ class Reconstruction:
             from .model import DeepNRSfM
 
             weights = {k.removeprefix("model/"): v for k, v in arrays.items() if k.startswith("model/")}
-            values["model"] = DeepNRSfM.from_arrays(json.loads(arrays["config"].item()), weights)
+            try:
+                values["model"] = DeepNRSfM.from_arrays(json.loads(arrays["config"].item()), weights)
+            except (ValueError, TypeError, RuntimeError):
+                raise ValueError(f"{path}: the network in it is incomplete or of another version.") from None
         return cls(**values)
+
+
+def as_points(W, visible=None):
+    """What every method takes: `Landmarks`, or an array or tensor of image points.
+
+    Parameters
+    ----------
+    W : Landmarks, or (F, P, 2) array or tensor
+    visible : (F, P) bool, optional
+        Default: that of the Landmarks, else everything.
+
+    Returns
+    -------
+    W : (F, P, 2) float64 array of its own, zero where hidden
+    visible : (F, P) bool array
+    names, edges
+        Those of the Landmarks, else empty.
+
+    Raises
+    ------
+    ValueError
+        For Landmarks without points2d, wrong shapes, no frames, visible points that are not finite, or
+        a frame with no visible point.
+    """
+    names, edges = (), ()
+    if isinstance(W, Landmarks):
+        if W.points2d is None:
+            raise ValueError("these Landmarks have no points2d; photograph them with datasets.make_views first.")
+        names, edges = W.names, W.edges
+        W, visible = W.points2d, W.visible if visible is None else visible
+    W = _as_array("W", W, float)
+    if W.ndim != 3 or W.shape[2] != 2 or not len(W):
+        raise ValueError(f"W has shape {W.shape}; expected (F, P, 2) with at least one frame.")
+    visible = np.ones(W.shape[:2], bool) if visible is None else _as_array("visible", visible, bool)
+    if visible.shape != W.shape[:2]:
+        raise ValueError(f"visible has shape {visible.shape}; expected {W.shape[:2]}.")
+    check_visible_finite("W", W, visible)
+    if not visible.any(1).all():
+        raise ValueError(f"frame {visible.any(1).argmin()} of W has no visible point; leave it out.")
+    return np.where(visible[..., None], W, 0.0), visible, names, edges
 
 
 def check_visible_finite(key, points, visible):
@@ -241,10 +282,11 @@ def check_visible_finite(key, points, visible):
         )
 
 
-def read_npz(path):
-    """All arrays of an .npz file as a dict, never unpickling.
+def read_npz(path, keys=None):
+    """The arrays of an .npz file as a dict, never unpickling; only those named in `keys`, if given.
 
-    Raises FileNotFoundError if there is no such file, ValueError if it is empty, broken or holds objects.
+    Raises FileNotFoundError if there is no such file, ValueError if it is empty or broken, or if an
+    array that is wanted holds objects.
     """
     path = Path(path)
     if not path.is_file():
@@ -255,18 +297,36 @@ def read_npz(path):
         raise ValueError(f"{path}: not an .npz file, or a truncated one.")
     try:
         with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            return {key: archive[key] for key in archive.files if keys is None or key in keys}
+    except Exception as error:  # a broken archive can raise nearly anything, down to zlib and the tokenizer
         raise ValueError(f"{path}: could not be read as .npz ({error}).") from None
 
 
 def _as_array(key, value, dtype):
+    """A copy of value as an array of float, int or bool; a mask must hold truth values or 0 and 1."""
     if hasattr(value, "detach"):
         value = value.detach().cpu().numpy()
     try:
-        return np.asarray(value, dtype)
+        array = np.array(value, dtype)
+        if dtype is bool and not np.array_equal(np.asarray(value, float), array):
+            raise ValueError
     except (TypeError, ValueError):
         raise ValueError(f"{key} cannot be read as an array of {dtype.__name__}.") from None
+    return array
+
+
+def _names_and_edges(names, edges, n_points):
+    names = tuple(str(n) for n in names) or tuple(f"point_{i}" for i in range(n_points))
+    if len(names) != n_points:
+        raise ValueError(f"names has {len(names)} entries for {n_points} points.")
+    edges = _as_array("edges", edges, int)
+    if edges.size == 0:
+        return names, edges.reshape(0, 2)
+    if edges.ndim != 2 or edges.shape[1] != 2:
+        raise ValueError(f"edges has shape {edges.shape}; expected (E, 2).")
+    if edges.min() < 0 or edges.max() >= n_points:
+        raise ValueError(f"edges refers to a point outside 0 … {n_points - 1}.")
+    return names, edges
 
 
 def _npz(path):

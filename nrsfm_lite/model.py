@@ -17,7 +17,7 @@ from .sparse_coding import mutual_coherence
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that decides the form of a network; the defaults are the paper's for motion capture.
+    """Everything that decides the form of a network; the defaults are those of the authors' code for motion capture.
 
     Parameters
     ----------
@@ -50,6 +50,8 @@ class Config:
     projection: str = "orthographic"
 
     def __post_init__(self):
+        for key in ("n_points", "n_dictionaries", "first_atoms", "last_atoms"):
+            object.__setattr__(self, key, int(getattr(self, key)))  # NumPy integers cannot be written as JSON
         if self.n_points < 3:
             raise ValueError(f"n_points is {self.n_points}; a shape needs at least 3 points.")
         if self.n_dictionaries < 1:
@@ -85,6 +87,8 @@ class DeepNRSfM(nn.Module):
             if n_points is None:
                 raise ValueError("DeepNRSfM needs n_points or a Config.")
             config = Config(n_points)
+        if not isinstance(config, Config):
+            raise ValueError(f"config is {config!r}; expected a Config, or n_points=… by name.")
         self.config = config
         P, K = config.n_points, config.widths
         self.D = nn.ParameterList(
@@ -183,6 +187,7 @@ class DeepNRSfM(nn.Module):
     @classmethod
     def from_arrays(cls, config, weights):
         """The network that `to_arrays` took apart."""
-        net = cls(Config(**config))
-        net.load_state_dict({k: torch.as_tensor(v) for k, v in weights.items()})
-        return net
+        weights = {k: torch.as_tensor(v) for k, v in weights.items()}
+        net = cls(Config(**config), generator=torch.Generator()).to(weights["scale"].dtype)
+        net.load_state_dict(weights)
+        return net.eval()

@@ -1,12 +1,13 @@
 """Pictures of shapes: matplotlib for the page, plotly to turn them. One look for the whole book."""
 
+from html import escape
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import plotly.graph_objects as go
 
-from .data import Landmarks, Reconstruction
+from .data import Landmarks, Reconstruction, as_points
 from .metrics import align
 
 # Readable on white and on black, and for readers who do not tell red from green.
@@ -45,9 +46,9 @@ def show3d(shapes, truth=None, edges=None, *, max_frames=60, up=None, title=None
     max_frames : int
         A longer motion is thinned out evenly, to keep pages small.
     up : (3,), optional
-        The direction that points up in the picture. Default: y where there is a truth. Else up is
-        where the cameras' images have their top (image y runs down), and if the cameras look from
-        everywhere, the longest axis of the mean shape.
+        The direction that points up in the picture. Default: y, except for a Reconstruction without
+        truth. There up is where the cameras' images have their top (image y runs down), and if the
+        cameras look from everywhere, the longest axis of the mean shape, either end up.
     title : str, optional
     height : int
         In pixels.
@@ -74,7 +75,7 @@ def show3d(shapes, truth=None, edges=None, *, max_frames=60, up=None, title=None
         points = _in_one_pose(points)
         up = _guess_up(points, shapes)
     turn = _upright((0, 1, 0) if up is None else up)
-    chosen = np.unique(np.linspace(0, len(points) - 1, min(len(points), max_frames)).round().astype(int))
+    chosen = _spread(len(points), max_frames)
     layers = [] if true_points is None else [(true_points @ turn, TRUE, _TRUE_NAME)]
     layers.append((points @ turn, PREDICTED, _PREDICTED_NAME if true_points is not None else "shape"))
 
@@ -102,14 +103,10 @@ def show2d(W, edges=None, frames=None, *, visible=None, columns=6):
     -------
     matplotlib Figure
     """
-    if isinstance(W, Landmarks):
-        edges = W.edges if edges is None else edges
-        W, visible = W.points2d, W.visible
-    W = np.asarray(W, float)
-    edges = np.zeros((0, 2), int) if edges is None else np.asarray(edges, int).reshape(-1, 2)
-    frames = np.linspace(0, len(W) - 1, columns).round().astype(int) if frames is None else np.asarray(frames)
-    if visible is not None:
-        W = np.where(np.asarray(visible)[..., None], W, np.nan)
+    W, visible, _, own_edges = as_points(W, visible)
+    W = np.where(visible[..., None], W, np.nan)
+    edges = np.asarray(own_edges if edges is None else edges, int).reshape(-1, 2)
+    frames = _spread(len(W), columns) if frames is None else np.asarray(frames)
     figure, axes = plt.subplots(1, len(frames), figsize=(1.5 * len(frames), 1.9), layout="constrained", squeeze=False)
     middle = np.nanmean(W[frames], axis=1)
     reach = 1.1 * np.nanmax(np.abs(W[frames] - middle[:, None]))
@@ -135,10 +132,10 @@ def compare(rec, truth, frames=None, *, columns=5):
     -------
     matplotlib Figure of three rows, one column per frame; each prediction is moved onto its truth.
     """
-    frames = np.linspace(0, len(rec) - 1, columns).round().astype(int) if frames is None else np.asarray(frames)
+    frames = _spread(len(rec), columns) if frames is None else np.asarray(frames)
     predicted, true = align(rec.shapes[frames], truth.points3d[frames])
-    seen = truth.points2d[frames] - truth.points2d[frames].mean(1, keepdims=True)
-    reach = 1.02 * max(np.abs(true).max(), np.abs(seen).max())
+    seen = truth.points2d[frames] - np.nanmean(truth.points2d[frames], axis=1, keepdims=True)
+    reach = 1.02 * max(np.abs(true).max(), np.nanmax(np.abs(seen)))
     rows = {
         "seen by the camera": [(seen, SEEN)],
         "in 3D, from one side": [(true[..., [0, 1]], TRUE), (predicted[..., [0, 1]], PREDICTED)],
@@ -162,12 +159,17 @@ def write_html(figure, path):
     title = figure.layout.title.text or path.stem
     page = figure.to_html(include_plotlyjs=True, full_html=True, config={"displaylogo": False, "responsive": True})
     head = (
-        f'<head><title>{title}</title><meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<head><title>{escape(title)}</title><meta name="viewport" content="width=device-width, initial-scale=1">'
         "<style>:root{color-scheme:light dark}body{margin:0;font-family:sans-serif}</style>"
         # Pausing an animation makes plotly reject its promise without a reason; that is no error.
         "<script>addEventListener('unhandledrejection',e=>{if(e.reason===undefined)e.preventDefault()})</script>"
     )
     path.write_text(page.replace("<head>", head, 1), encoding="utf-8")
+
+
+def _spread(n_frames, at_most):
+    """Indices of frames, evenly spread from the first to the last."""
+    return np.linspace(0, n_frames - 1, min(n_frames, at_most)).round().astype(int)
 
 
 def _draw2d(axis, points, edges, colour):

@@ -36,11 +36,20 @@ def frame_scale(X, visible):
 
 
 def set_scale(X, visible):
-    """One scale for a whole set of centred frames: the root mean square over all visible coordinates.
+    """One scale for a whole set of centred frames: the root mean square over all visible coordinates."""
+    return (X.square().sum() / (2 * visible.sum())).sqrt()
 
-    Raises ValueError if all points of all frames coincide.
+
+def check_extent(W, visible):
+    """Raise ValueError, naming the frame, where all visible points of a frame are at one place.
+
+    Up to the rounding of the coordinates, which grows with their distance from the origin.
     """
-    scale = (X.square().sum() / (2 * visible.sum())).sqrt()
-    if not scale > 0:
+    X, _ = center(W, visible)
+    extent = X.abs().amax((1, 2))
+    point = extent <= 1e-9 * torch.where(visible[..., None], W, 0.0).abs().amax((1, 2))
+    if point.all():
         raise ValueError("W has all its visible points at one place in every frame; there is no shape to see.")
-    return scale
+    if point.any():
+        frame = int(point.nonzero()[0])
+        raise ValueError(f"frame {frame} of W has all its visible points at one place; leave it out.")

@@ -5,9 +5,9 @@ import torch
 
 from . import preprocessing
 from .cameras import nearest_orthonormal
-from .data import Landmarks, Reconstruction
+from .data import Reconstruction, as_points
 from .model import Config
-from .training import check_points, fit, use_threads
+from .training import fit, use_threads
 
 _CHUNK = 4096  # frames per pass: memory stays flat in the number of frames
 _REFINE_STEPS = 150
@@ -46,7 +46,7 @@ def reconstruct(
     refine : bool
         Fit each frame's code and camera after the network's guess. False: one forward pass.
     seed, device, progress, checkpoint
-        As in `fit`.
+        As in `fit`; they concern the training. Inference runs where the model is.
 
     Returns
     -------
@@ -57,13 +57,9 @@ def reconstruct(
     ValueError
         As `fit`; also if `model` was trained for another number of points or another projection.
     """
-    names, edges = (), ()
-    if isinstance(W, Landmarks):
-        if W.points2d is None:
-            raise ValueError("these Landmarks have no points2d; photograph them with datasets.make_views first.")
-        names, edges = W.names, W.edges
-        W, visible = W.points2d, W.visible if visible is None else visible
-    W, visible = check_points(W, visible)
+    W, visible, names, edges = as_points(W, visible)
+    W, visible = torch.as_tensor(W), torch.as_tensor(visible)
+    preprocessing.check_extent(W, visible)
     if model is None:
         config = Config(n_points=W.shape[1], projection=projection)
         model = fit(W, visible, config, steps=steps, seed=seed, device=device, progress=progress, checkpoint=checkpoint)
@@ -103,6 +99,8 @@ def infer(model, W, visible, refine=True):
     -------
     S (B, P, 3) centred, M (B, 3, 2), t (B, 2): tensors in the units of W.
     """
+    device = model.scale.device
+    W, visible = W.to(device), visible.to(device)
     X, scale = model.normalize(W, visible)
     X = X.to(model.scale.dtype)
     with torch.no_grad():
@@ -116,23 +114,22 @@ def infer(model, W, visible, refine=True):
         M = nearest_orthonormal(M.double())
     S = (S - S.mean(1, keepdim=True)) * scale[:, None, None].double()
     t = preprocessing.visible_mean(W - S @ M, visible)
-    return S, M, t
+    return S.cpu(), M.cpu(), t.cpu()
 
 
 def _refine(model, X, visible, psi, M):
     """Code (B, K) and camera (B, 3, 2) after Adam on each frame's reprojection error."""
     weight = visible[..., None].to(X.dtype)
-    unit = psi.abs().mean().clamp(min=1e-6)  # codes live on the network's own scale
+    unit = psi.abs().mean(1, keepdim=True).clamp(min=1e-6)  # codes live on the network's own scale
     code, camera = (psi / unit).clone().requires_grad_(), M.clone().requires_grad_()
     optimizer = torch.optim.Adam([code, camera], _REFINE_RATE)
     for step in range(_REFINE_STEPS):
         for group in optimizer.param_groups:
             group["lr"] = _REFINE_RATE * (1 - step / _REFINE_STEPS)
-        S = model.decode(code * unit)
-        residual = (X - S @ nearest_orthonormal(camera)) * weight
-        # Each frame on its own: the sum's gradient for one frame does not see the others.
-        grads = torch.autograd.grad(residual.square().sum(), [code, camera])
-        code.grad, camera.grad = grads
+        with torch.enable_grad():
+            residual = (X - model.decode(code * unit) @ nearest_orthonormal(camera)) * weight
+            # Each frame on its own: the sum's gradient for one frame does not see the others.
+            code.grad, camera.grad = torch.autograd.grad(residual.square().sum(), [code, camera])
         optimizer.step()
     with torch.no_grad():
         return code * unit, nearest_orthonormal(camera)

@@ -8,12 +8,11 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from tqdm import tqdm
 
 from . import preprocessing
-from .data import check_visible_finite
+from .data import as_points
 from .model import Config, DeepNRSfM
 
 MIN_FRAMES = 10
@@ -61,14 +60,15 @@ def fit(
     checkpoint=None,
     threads=1,
 ):
-    """Train a network on 2D landmarks. No 3D is ever seen.
+    """Train a network on 2D landmarks. No 3D is ever seen, not even that of Landmarks which have it.
 
     The loss is the paper's: the reprojection error ‖W − S M‖_F of each frame over its visible points,
-    divided by ‖W‖_F as in the authors' code.
+    divided by ‖W‖_F as in the authors' code. Gradients are clipped to norm 1, and a step whose
+    gradient is not finite is left out.
 
     Parameters
     ----------
-    W : (F, P, 2) array or tensor
+    W : Landmarks, or (F, P, 2) array or tensor
         Image points; hidden ones may be NaN.
     visible : (F, P) bool, optional
         Default: all visible.
@@ -77,7 +77,7 @@ def fit(
     schedule : "default" or "original"
         The package's schedule, or the authors' (200,000 steps of Adam on 32 frames).
     steps : int, optional
-        Another number of steps; the learning rates follow.
+        Another number of steps; the default schedule stretches its learning rates to it.
     seed : int
         Decides the weights at the start and the order of the frames. No global state is touched.
     device : str or torch.device, optional
@@ -99,8 +99,10 @@ def fit(
     ------
     ValueError
         For arrays of wrong shape, visible points that are not finite, too few frames or points, a
-        frame with no visible point, points that all coincide, an unknown schedule, or a checkpoint
+        frame with no visible point or all of them at one place, an unknown schedule, or a checkpoint
         that belongs to other data or settings.
+    FloatingPointError
+        If 100 steps in a row have no finite gradient.
     """
     if schedule not in SCHEDULES:
         raise ValueError(f"schedule={schedule!r}; expected one of {', '.join(SCHEDULES)}.")
@@ -108,7 +110,10 @@ def fit(
     steps = plan.steps if steps is None else int(steps)
     if steps < 1:
         raise ValueError(f"steps={steps}; expected at least 1.")
-    W, visible = check_points(W, visible)
+    if checkpoint is not None and not Path(checkpoint).parent.is_dir():
+        raise FileNotFoundError(f"{Path(checkpoint).parent}: no such folder for the checkpoint.")
+    W, visible, _, _ = as_points(W, visible)
+    W, visible = torch.as_tensor(W), torch.as_tensor(visible)
     F, P, _ = W.shape
     if F < MIN_FRAMES or P < MIN_POINTS:
         raise ValueError(
@@ -120,15 +125,14 @@ def fit(
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
 
+    preprocessing.check_extent(W, visible)
+    seed = int(seed)
     random = torch.Generator().manual_seed(seed)
     net = DeepNRSfM(config, generator=random)
     X, _ = preprocessing.center(W, visible)
     net.scale.fill_(preprocessing.set_scale(X, visible))
     X = net.normalize(W, visible)[0].float().to(device)
     size = X.flatten(1).norm(dim=1)
-    if not (size > 0).all():
-        frame = int((size <= 0).nonzero()[0])
-        raise ValueError(f"frame {frame} of W has all its visible points at one place; leave it out.")
     net.to(device)
     visible = visible.to(device)
     optimizers = _optimizers(net, plan)
@@ -137,7 +141,7 @@ def fit(
     key = _fingerprint(config, plan, steps, seed, X, visible)
     first = _resume(checkpoint, key, net, optimizers, rates, random)
 
-    running = None
+    running, skipped = None, 0
     bar = tqdm(range(first, steps), initial=first, total=steps, desc="training", disable=not progress, mininterval=0.5)
     with use_threads(threads):
         for step in bar:
@@ -153,30 +157,16 @@ def fit(
             if torch.isfinite(norm):  # a camera one step from degenerate can ask for an infinite step
                 for optimizer in optimizers:
                     optimizer.step()
+                running = loss.item() if running is None else 0.98 * running + 0.02 * loss.item()
+                bar.set_postfix(loss=f"{running:.4f}", refresh=False)
+            skipped = 0 if torch.isfinite(norm) else skipped + 1
+            if skipped == 100:
+                raise FloatingPointError(f"training has diverged: no finite gradient since step {step - 99}.")
             for rate in rates:
                 rate.step()
-            running = loss.item() if running is None else 0.98 * running + 0.02 * loss.item()
-            bar.set_postfix(loss=f"{running:.4f}", refresh=False)
             if checkpoint and ((step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == steps):
                 _save(checkpoint, key, step + 1, net, optimizers, rates, random)
     return net.cpu().eval()
-
-
-def check_points(W, visible=None):
-    """W (F, P, 2) and visible (F, P) as tensors, NaN-free; raises the ValueErrors of `fit`."""
-    W = torch.as_tensor(np.asarray(W, dtype=float) if not torch.is_tensor(W) else W.detach().cpu().double())
-    if W.ndim != 3 or W.shape[2] != 2:
-        raise ValueError(f"W has shape {tuple(W.shape)}; expected (F, P, 2).")
-    if visible is None:
-        visible = torch.ones(W.shape[:2], dtype=torch.bool)
-    visible = torch.as_tensor(visible).bool()
-    if visible.shape != W.shape[:2]:
-        raise ValueError(f"visible has shape {tuple(visible.shape)}; expected {tuple(W.shape[:2])}.")
-    check_visible_finite("W", W.numpy(), visible.numpy())
-    if not visible.any(1).all():
-        frame = int((~visible.any(1)).nonzero()[0])
-        raise ValueError(f"frame {frame} of W has no visible point; leave it out.")
-    return torch.where(visible[..., None], W, 0.0), visible
 
 
 def _loss(net, X, visible, size):
@@ -249,7 +239,7 @@ def _resume(path, key, net, optimizers, rates, random):
     if path is None or not Path(path).exists():
         return 0
     try:
-        state = torch.load(path, weights_only=True)
+        state = torch.load(path, weights_only=True, map_location="cpu")
     except Exception as error:  # torch raises many kinds for a broken file
         raise ValueError(f"{path}: not a checkpoint, or a broken one ({type(error).__name__}).") from None
     if not isinstance(state, dict) or state.get("key") != key:

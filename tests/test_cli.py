@@ -82,6 +82,10 @@ def test_bad_files_get_one_sentence_and_exit_code_2(tmp_path, capsys):
 def test_a_folder_that_is_not_there_is_noticed_before_training(points, tmp_path, capsys):
     assert main(["reconstruct", str(points), "--out", str(tmp_path / "no" / "scene.html")]) == 2
     assert "no such folder" in capsys.readouterr().err
+    assert main(["reconstruct", str(points), "--out", str(tmp_path)]) == 2
+    assert "is a folder" in capsys.readouterr().err
+    assert main(["reconstruct", str(points), "--checkpoint", str(tmp_path / "no" / "c.pt")]) == 2
+    assert "no such folder" in capsys.readouterr().err
 
 
 def test_view_of_something_else(points, tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 import nrsfm_lite as nl
 
@@ -46,6 +47,8 @@ def test_split_of_one_sequence_is_refused(landmarks):
         ({"points3d": np.full((3, 4, 3), np.inf)}, "not finite"),
         ({"points2d": np.zeros((3, 4, 2)), "names": "abc"}, "3 entries for 4 points"),
         ({"points2d": np.zeros((3, 4, 2)), "edges": [(0, 4)]}, "outside"),
+        ({"points2d": np.zeros((3, 4, 2)), "edges": [0, 1, 2]}, r"edges has shape \(3,\)"),
+        ({"points2d": np.zeros((3, 4, 2)), "visible": np.full((3, 4), 0.5)}, "visible cannot be read"),
         ({"points2d": [[["a", "b"]]]}, "cannot be read as an array"),
     ],
 )
@@ -70,16 +73,20 @@ def test_landmarks_round_trip(landmarks, tmp_path):
 
 
 def test_reconstruction_reprojects_as_promised(rng):
-    rec = nl.Reconstruction(rng.normal(size=(3, 5, 3)), nl.cameras.random_cameras(3), rng.normal(size=(3, 2)))
-    np.testing.assert_allclose(rec.projections, rec.shapes @ rec.cameras + rec.translations[:, None])
+    S, M, t = rng.normal(size=(3, 5, 3)), nl.cameras.random_cameras(3), rng.normal(size=(3, 2))
+    W = nl.Reconstruction(S, M, t).projections
+    for f, p in [(0, 0), (1, 4), (2, 2)]:
+        np.testing.assert_allclose(W[f, p], S[f, p] @ M[f] + t[f])
 
 
 def test_reconstruction_round_trip_with_its_network(rng, tmp_path):
     net = nl.DeepNRSfM(nl.Config(5, n_dictionaries=3, first_atoms=8, last_atoms=3))
     W = rng.normal(size=(4, 5, 2))
     rec = nl.reconstruct(W, model=net)
-    rec.save(tmp_path / "walk")  # the ending is added
-    again = nl.Reconstruction.load(tmp_path / "walk.npz")
+    assert rec.save(tmp_path / "walk") == tmp_path / "walk.npz"  # the ending is added
+    state = torch.get_rng_state()
+    again = nl.Reconstruction.load(tmp_path / "walk")
+    assert torch.equal(torch.get_rng_state(), state)
     np.testing.assert_array_equal(again.shapes, rec.shapes)
     assert (again.coherence, again.method, again.converged) == (rec.coherence, rec.method, rec.converged)
     np.testing.assert_array_equal(nl.reconstruct(W, model=again.model).shapes, rec.shapes)
@@ -97,8 +104,24 @@ def test_wrong_reconstructions_are_refused(rng, landmarks, tmp_path):
         nl.Reconstruction(np.zeros((3, 5, 2)), np.zeros((3, 3, 2)))
     with pytest.raises(ValueError, match="cameras has shape"):
         nl.Reconstruction(np.zeros((3, 5, 3)), np.zeros((2, 3, 2)))
+    with pytest.raises(ValueError, match="outside 0 … 4"):
+        nl.Reconstruction(np.zeros((3, 5, 3)), np.zeros((3, 3, 2)), edges=[(0, 5)])
     landmarks.save(tmp_path / "l.npz")
     with pytest.raises(ValueError, match="not a saved reconstruction"):
         nl.Reconstruction.load(tmp_path / "l.npz")
     with pytest.raises(FileNotFoundError, match="no such file"):
         nl.Reconstruction.load(tmp_path / "none.npz")
+
+
+def test_a_reconstruction_with_half_a_network_is_refused(rng, tmp_path):
+    net = nl.DeepNRSfM(nl.Config(5, n_dictionaries=3, first_atoms=8, last_atoms=3))
+    file = nl.reconstruct(rng.normal(size=(4, 5, 2)), model=net).save(tmp_path / "r")
+    arrays = dict(np.load(file))
+    del arrays["model/gamma"]
+    np.savez(file, **arrays)
+    with pytest.raises(ValueError, match="the network in it is incomplete"):
+        nl.Reconstruction.load(file)
+
+
+def test_landmarks_compare_as_objects(landmarks):
+    assert landmarks == landmarks and landmarks != landmarks[:]

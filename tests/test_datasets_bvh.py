@@ -106,6 +106,19 @@ def test_edges_bridge_what_is_dropped():
     assert kept_edges([-1, 0, 1, 2, 2], [0, 3, 4]).tolist() == [[0, 1], [0, 2]]
 
 
+def test_two_end_sites_under_one_joint_are_two_points(arm):
+    second = "    End Site\n    {\n      OFFSET 0 9 0\n    }\n"
+    arm.write_text(ARM.replace("    End Site", second + "    End Site"))
+    data = datasets.load_bvh(arm)
+    assert data.names[2:] == ("elbow_end", "elbow_end_2")
+    np.testing.assert_allclose(data.points3d[0, 2:], [[2, 10, 0], [3, 1, 0]], atol=1e-12)
+
+
+def test_a_byte_order_mark_is_no_obstacle(arm):
+    arm.write_text(ARM, encoding="utf-8-sig")
+    assert len(datasets.load_bvh(arm, every=2.0)) == 1
+
+
 def test_a_folder_and_a_list(arm, tmp_path):
     (tmp_path / "b.bvh").write_text(ARM)
     (tmp_path / "notes.txt").write_text("not a motion")
@@ -135,6 +148,13 @@ def test_a_folder_and_a_list(arm, tmp_path):
         (ARM.replace("5 6 7  90 0 0  90 0 0", "5 6 7  90"), "line 20: 4 values, expected 9"),
         (ARM.replace("5 6 7", "5 six 7"), "line 20: expected a number, found 'six'"),
         (ARM.replace("5 6 7", "5 nan 7"), "line 20: a motion value is nan"),
+        (ARM.replace("OFFSET 2 0 0", "OFFSET 2 nan 0"), "line 8: expected a number, found 'nan'"),
+        (ARM.replace("CHANNELS 6", "CHANNELS inf"), "line 5: expected a number, found 'inf'"),
+        (
+            ARM.replace("Zrotation Yrotation Xrotation", "Zrotation Zrotation Xrotation"),
+            "line 9: a channel is named twice",
+        ),
+        (ARM + "1 1 1  0 0 0  0 0 0\n", "line 21: 3 frames of motion, but 'Frames: 2' promised.$"),
     ],
 )
 def test_broken_files_are_refused_with_file_and_line(arm, text, message):
@@ -149,8 +169,13 @@ def test_files_that_are_not_there(tmp_path):
         datasets.load_bvh(tmp_path / "none.bvh")
     with pytest.raises(FileNotFoundError, match=r"no \.bvh file in this folder"):
         datasets.load_bvh(tmp_path)
+    with pytest.raises(ValueError, match="an empty list"):
+        datasets.load_bvh([])
+    with pytest.raises(ValueError, match="expected a sequence of names"):
+        datasets.load_bvh(tmp_path, joints="hip")
 
 
+@pytest.mark.realdata
 def test_real_motion_capture_is_a_person(real_data):
     file = real_data / "cmu_bvh" / "martial" / "04.bvh"
     if not file.exists():

@@ -94,6 +94,7 @@ def test_wrong_input_is_refused(S, S_true, message):
         metrics.normalized_error(S, S_true)
 
 
+@pytest.mark.realdata
 def test_real_reconstructions_have_their_listed_errors(real_data):
     """The per-frame errors of reconstructions by the classical MATLAB codes, scale not fitted."""
     listed = {"CNS_pickup": 0.0482, "CNS_yoga": 0.0349, "CNS_stretch": 0.0323, "CNS_dance": 0.0685,

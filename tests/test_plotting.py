@@ -77,9 +77,17 @@ def test_show2d_draws_what_is_visible(motion):
     np.testing.assert_array_equal(np.isnan(x), ~views.visible[0])
 
 
+def test_pictures_of_few_frames_and_hidden_points(motion):
+    views = nl.datasets.make_views(motion, missing=5)
+    assert len(nl.plotting.show2d(views[:3]).axes) == 3
+    rec = nl.Reconstruction(views.points3d, views.cameras)
+    figure = nl.plotting.compare(rec, views, columns=2)
+    assert np.isfinite(figure.axes[0].lines[1].get_xdata()).sum() == views.visible[0].sum()
+
+
 def test_an_exported_scene_is_one_page_that_asks_nobody(motion, tmp_path):
-    nl.plotting.write_html(nl.plotting.show3d(motion, title="walk"), tmp_path / "scene.html")
+    nl.plotting.write_html(nl.plotting.show3d(motion, title="<walk>"), tmp_path / "scene.html")
     page = (tmp_path / "scene.html").read_text()
-    assert "<title>walk</title>" in page and 'name="viewport"' in page
+    assert "<title>&lt;walk&gt;</title>" in page and 'name="viewport"' in page
     assert not re.findall(r"""<(?:script|link|img)[^>]+(?:src|href)=["']?(?:https?:)?//""", page)
     assert len(page) < 8e6

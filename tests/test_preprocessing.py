@@ -40,7 +40,12 @@ def test_scale_is_isotropic_and_makes_unit_rms(points):
         assert x[v].square().mean() == pytest.approx(1)
 
 
-def test_points_at_one_place_are_refused():
-    X, visible = torch.zeros(3, 4, 2), torch.ones(3, 4, dtype=torch.bool)
+@pytest.mark.parametrize("place", [0.0, 0.1, 0.7, 123.4, 1e6 / 3])
+def test_points_at_one_place_are_refused(points, place):
+    W, visible = points
+    preprocessing.check_extent(W, visible)
+    W[3, visible[3]] = place  # its mean may differ from it by a rounding
+    with pytest.raises(ValueError, match="frame 3 of W has all its visible points at one place"):
+        preprocessing.check_extent(W, visible)
     with pytest.raises(ValueError, match="no shape to see"):
-        preprocessing.set_scale(X, visible)
+        preprocessing.check_extent(torch.full((3, 4, 2), place), torch.ones(3, 4, dtype=torch.bool))

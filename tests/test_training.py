@@ -103,6 +103,19 @@ def test_a_nonfinite_gradient_costs_a_step_not_the_run(views, monkeypatch):
     assert all(torch.isfinite(p).all() for p in net.parameters())
 
 
+def test_a_run_that_has_diverged_says_so(views, monkeypatch):
+    loss = training._loss
+    monkeypatch.setattr(training, "_loss", lambda *inputs: loss(*inputs) * torch.nan)
+    with pytest.raises(FloatingPointError, match="no finite gradient since step 0"):
+        nl.fit(views.points2d, None, SMALL, steps=200, progress=False)
+
+
+def test_numpy_integers_are_integers(views, tmp_path):
+    config = nl.Config(np.int64(6), np.int64(3), np.int64(16), np.int64(4))
+    net = nl.fit(views, None, config, steps=2, seed=np.int64(3), checkpoint=tmp_path / "c.pt", progress=False)
+    assert net.config == SMALL
+
+
 def test_hidden_points_do_not_change_the_result(views):
     visible = np.ones((200, 6), bool)
     visible[::3, 2] = False
@@ -129,11 +142,12 @@ def one_place():
         (np.zeros((20, 6, 3)), {}, r"expected \(F, P, 2\)"),
         (np.full((20, 6, 2), np.nan), {}, "visible points that are NaN"),
         (np.ones((20, 6, 2)), {"visible": np.ones((20, 5))}, r"visible has shape \(20, 5\)"),
+        (np.full((20, 6, 2), 0.1), {}, "no shape to see"),
         (np.ones((20, 6, 2)), {"visible": dead_frame()}, "frame 7 of W has no visible point"),
         (np.ones((20, 6, 2)), {}, "no shape to see"),
         (one_place(), {}, "frame 3 of W has all its visible points at one place"),
-        (np.ones((2, 6, 2)), {}, "at least 10 frames and 4 points; got 2 frames of 6 points"),
-        (np.ones((20, 3, 2)), {}, "got 20 frames of 3 points"),
+        (one_place()[:2], {}, "at least 10 frames and 4 points; got 2 frames of 6 points"),
+        (one_place()[:, :3], {}, "got 20 frames of 3 points"),
         (np.ones((20, 6, 2)), {"config": nl.Config(5)}, "config.n_points is 5"),
         (np.ones((20, 6, 2)), {"schedule": "fast"}, "schedule='fast'"),
         (np.ones((20, 6, 2)), {"steps": 0}, "steps=0"),

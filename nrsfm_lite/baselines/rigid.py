@@ -4,16 +4,16 @@ import numpy as np
 import torch
 
 from ..cameras import nearest_orthonormal
-from ..data import Landmarks, Reconstruction, check_visible_finite
+from ..data import Reconstruction, as_points
 
 
 def tomasi_kanade(W, visible=None):
-    """The one rigid shape, and a camera per frame, that explain all images best.
+    """One rigid shape for all images, and a camera per frame, as if nothing moved.
 
-    Objective: ``min Σ_f ‖W_f − S M_f‖²`` by the rank-3 singular value decomposition of all frames
-    stacked, then the metric upgrade that makes the cameras' columns orthonormal in the least-squares
-    sense (linear in the Gram matrix Q of the upgrade). Cost O(F P²). On a non-rigid motion it shows
-    what the cameras alone can explain.
+    The nearest rank-3 matrix to all frames stacked, by singular value decomposition, then the metric
+    upgrade that makes the cameras' columns orthonormal in the least-squares sense (linear in the Gram
+    matrix Q of the upgrade), then each camera made orthonormal on its own. Exact on rigid data without
+    noise; else a good start, not the minimum of the reprojection error. Cost O(F P²).
 
     Parameters
     ----------
@@ -31,23 +31,16 @@ def tomasi_kanade(W, visible=None):
         With hidden points, fewer than 3 frames or 4 points, or if all points lie in one plane or the
         views are all alike (rank below 3).
     """
-    names, edges = (W.names, W.edges) if isinstance(W, Landmarks) else ((), ())
-    if isinstance(W, Landmarks):
-        W, visible = W.points2d, W.visible if visible is None else visible
-    W = np.asarray(W, float)
-    if W.ndim != 3 or W.shape[2] != 2:
-        raise ValueError(f"W has shape {W.shape}; expected (F, P, 2).")
+    W, visible, names, edges = as_points(W, visible)
     F, P, _ = W.shape
-    visible = np.ones((F, P), bool) if visible is None else np.asarray(visible, bool)
     if not visible.all():
         raise ValueError(f"tomasi_kanade needs every point visible; {(~visible).sum()} are hidden.")
-    check_visible_finite("W", W, visible)
     if F < 3 or P < 4:
         raise ValueError(f"tomasi_kanade needs at least 3 frames and 4 points; got {F} and {P}.")
     t = W.mean(1)
     X = (W - t[:, None]).transpose(0, 2, 1).reshape(2 * F, P)  # rows: x and y of each frame
     U, s, Vh = np.linalg.svd(X, full_matrices=False)
-    if s[2] < 1e-9 * s[0]:
+    if s[2] <= 1e-9 * s[0]:
         raise ValueError("W has rank below 3: the points lie in one plane, or all views are alike.")
     motion = (U[:, :3] * np.sqrt(s[:3])).reshape(F, 2, 3)
     G = _metric_upgrade(motion)

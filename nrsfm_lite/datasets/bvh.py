@@ -47,18 +47,21 @@ def load_bvh(path, joints=None, every=1):
     """
     if int(every) != every or every < 1:
         raise ValueError(f"every={every}; expected a whole number of at least 1.")
+    if isinstance(joints, str):
+        raise ValueError(f"joints={joints!r}; expected a sequence of names.")
+    joints = None if joints is None else tuple(joints)
     files = _files(path)
     points, sequence = [], []
     names = edges = None
     for i, file in enumerate(files):
-        all_names, parents, positions = read_bvh(file, every)
-        wanted = tuple(all_names if joints is None else joints)
+        all_names, parents, positions = read_bvh(file, int(every))
+        wanted = tuple(all_names) if joints is None else joints
         missing = [j for j in wanted if j not in all_names]
         if missing:
             raise KeyError(f"{file}: no joint named {', '.join(missing)}; it has {', '.join(all_names)}.")
         if names is not None and wanted != names:
             raise ValueError(f"{file}: other joints than {files[0]}; choose common ones with joints=.")
-        keep = [all_names.index(j) for j in wanted]
+        keep = range(len(all_names)) if joints is None else [all_names.index(j) for j in wanted]
         names, edges = wanted, kept_edges(parents, keep)
         points.append(positions[:, keep])
         sequence.append(np.full(len(positions), i))
@@ -69,11 +72,14 @@ def load_bvh(path, joints=None, every=1):
 
 
 def read_bvh(file, every=1):
-    """Names (J), parents (J) and positions (F, J, 3) of all joints and end sites of one file."""
+    """Names (J), parents (J) and positions (F, J, 3) of all joints and end sites of one file.
+
+    Names are unique: a second joint of the same name gets ``_2``, and so on. Raises as `load_bvh`.
+    """
     file = Path(file)
     if not file.is_file():
         raise FileNotFoundError(f"{file}: no such file.")
-    lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     if not any(line.strip() for line in lines):
         raise ValueError(f"{file}: the file is empty.")
     names, parents, offsets, channels, at = _hierarchy(file, lines)
@@ -96,6 +102,8 @@ def read_bvh(file, every=1):
 
 def _files(path):
     if not isinstance(path, (str, Path)):
+        if not len(path):
+            raise ValueError("path is an empty list; expected at least one .bvh file.")
         return [Path(p) for p in path]
     path = Path(path)
     if not path.is_dir():
@@ -125,9 +133,12 @@ def _hierarchy(file, lines):
     def number():
         token, n = take()
         try:
-            return float(token)
+            value = float(token)
         except ValueError:
+            value = np.nan
+        if not np.isfinite(value):
             fail(f"expected a number, found {token!r}.", n)
+        return value
 
     if tokens[0][0].upper() != "HIERARCHY":
         fail("not a BVH file: it does not begin with HIERARCHY.", tokens[0][1])
@@ -140,8 +151,11 @@ def _hierarchy(file, lines):
             if (word == "ROOT") != (not stack):
                 fail(f"{token} in the wrong place.", n)
             label, _ = take()
+            label = f"{names[stack[-1]]}_end" if word == "END" else label
             parents.append(stack[-1] if stack else -1)
-            names.append(f"{names[stack[-1]]}_end" if word == "END" else label)
+            names.append(
+                label if label not in names else f"{label}_{2 + sum(k.startswith(label + '_') for k in names)}"
+            )
             offsets.append(np.zeros(3))
             channels.append(())
             pending = len(names) - 1
@@ -161,6 +175,8 @@ def _hierarchy(file, lines):
             unknown = [c for c in channels[stack[-1]] if not re.fullmatch("[xyz](position|rotation)", c)]
             if unknown:
                 fail(f"unknown channel {unknown[0]!r}.", n)
+            if len(set(channels[stack[-1]])) < len(channels[stack[-1]]):
+                fail("a channel is named twice.", n)
         elif word == "MOTION" and not stack and names:
             return names, parents, np.array(offsets), channels, n
         else:
@@ -201,7 +217,5 @@ def _explain_motion(file, rows, n_frames, n_channels, last):
             raise ValueError(
                 f"{file}, line {n}: {len(line.split())} values, expected {n_channels}; the file may be truncated."
             )
-    raise ValueError(
-        f"{file}, line {last}: {len(rows)} frames of motion, but 'Frames: {n_frames}' promised; "
-        "the file may be truncated."
-    )
+    hint = "; the file may be truncated" if len(rows) < n_frames else ""
+    raise ValueError(f"{file}, line {last}: {len(rows)} frames of motion, but 'Frames: {n_frames}' promised{hint}.")

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from ..data import Landmarks, read_npz
 
 _KEYS = ("points2d", "visible", "confidence", "points3d", "cameras", "translations", "sequence", "names", "edges")
@@ -26,12 +28,13 @@ def load_npz(path):
         If it is empty, broken or truncated, or if its arrays do not fit together.
     """
     path = Path(path)
-    arrays = read_npz(path)
+    arrays = read_npz(path, keys={*_KEYS, "W", "S", "name"})
     for short, key in [("W", "points2d"), ("S", "points3d")]:
         if short in arrays:
             arrays.setdefault(key, arrays[short])
     if not {"points2d", "points3d"} & arrays.keys():
-        found = ", ".join(sorted(arrays)) or "nothing"
+        with np.load(path, allow_pickle=False) as archive:
+            found = ", ".join(sorted(archive.files)) or "nothing"
         raise KeyError(f"{path}: needs an array points2d (or W) or points3d (or S); it has {found}.")
     chosen = {key: arrays[key] for key in _KEYS if key in arrays}
     try:

@@ -198,12 +198,14 @@ def make_motion(n_frames=4000, seed=0, actions=None):
     Raises
     ------
     ValueError
-        If n_frames is below 1.
+        If n_frames is below 1, or actions is a single string.
     KeyError
         If an action is unknown.
     """
     if n_frames < 1:
         raise ValueError(f"n_frames={n_frames}; expected at least 1.")
+    if isinstance(actions, str):
+        raise ValueError(f"actions={actions!r}; expected a sequence of names.")
     actions = ACTIONS if actions is None else tuple(actions)
     unknown = [a for a in actions if a not in _ACTIONS]
     if unknown or not actions:

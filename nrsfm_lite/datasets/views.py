@@ -9,7 +9,7 @@ from ..data import Landmarks
 
 
 def make_views(data, seed=0, projection="orthographic", missing=0, noise=0.0, scale_range=None, translation_range=None):
-    """One random view of each frame of a motion.
+    """One random view of each frame of a motion, whose shapes are first centred over their points.
 
     Parameters
     ----------
@@ -29,7 +29,8 @@ def make_views(data, seed=0, projection="orthographic", missing=0, noise=0.0, sc
 
     Returns
     -------
-    Landmarks with points2d, visible, cameras, translations and the points3d of `data`.
+    Landmarks with points2d, visible, cameras, translations, and as points3d the centred (for weak
+    perspective also scaled) shapes of `data`, so that ``points3d @ cameras + translations`` is the image.
 
     Raises
     ------
@@ -42,8 +43,10 @@ def make_views(data, seed=0, projection="orthographic", missing=0, noise=0.0, sc
         raise ValueError(f"projection={projection!r}; expected 'orthographic' or 'weak_perspective'.")
     if scale_range is not None and projection == "orthographic":
         raise ValueError("scale_range has no meaning for orthographic views; use projection='weak_perspective'.")
-    if noise < 0:
-        raise ValueError(f"noise={noise}; expected 0 or more.")
+    if not 0 <= noise < np.inf:
+        raise ValueError(f"noise={noise}; expected a number of at least 0.")
+    if translation_range is not None and not (np.isscalar(translation_range) and translation_range >= 0):
+        raise ValueError(f"translation_range={translation_range}; expected a number of at least 0.")
     n_frames, n_points = data.visible.shape
     # One stream per purpose: asking for noise does not change the cameras.
     cameras_rng, scale_rng, shift_rng, noise_rng, hide_rng = (
@@ -52,7 +55,7 @@ def make_views(data, seed=0, projection="orthographic", missing=0, noise=0.0, sc
     cameras = random_cameras(n_frames, cameras_rng)
     S = data.points3d - data.points3d.mean(1, keepdims=True)
     if projection == "weak_perspective":
-        low, high = scale_range or (0.5, 1.5)
+        low, high = (0.5, 1.5) if scale_range is None else scale_range
         if not 0 < low <= high:
             raise ValueError(f"scale_range={scale_range}; expected 0 < low <= high.")
         S = S * scale_rng.uniform(low, high, (n_frames, 1, 1))
@@ -67,7 +70,9 @@ def make_views(data, seed=0, projection="orthographic", missing=0, noise=0.0, sc
     )
     visible = _hide(hide_rng, missing, n_frames, n_points)
     W = np.where(visible[..., None], W + perturbation + translations[:, None], np.nan)
-    return replace(data, points2d=W, visible=visible, points3d=S, cameras=cameras, translations=translations)
+    return replace(
+        data, points2d=W, visible=visible, confidence=None, points3d=S, cameras=cameras, translations=translations
+    )
 
 
 def _hide(rng, missing, n_frames, n_points):
@@ -77,7 +82,9 @@ def _hide(rng, missing, n_frames, n_points):
     whole = isinstance(missing, (int, np.integer))
     most = int(missing) if whole else round(missing * n_points)
     if not 0 <= most < n_points:
-        raise ValueError(f"missing={missing} hides {most} of {n_points} points; at least one must stay visible.")
+        raise ValueError(
+            f"missing={missing}; expected to hide at least 0 and at most {n_points - 1} of {n_points} points."
+        )
     counts = rng.integers(1, most + 1, n_frames) if whole and most else np.full(n_frames, most)
     rank = rng.random((n_frames, n_points)).argsort(1).argsort(1)  # a random order of the points per frame
     return rank >= counts[:, None]
