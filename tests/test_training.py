@@ -103,6 +103,7 @@ def test_a_nonfinite_gradient_costs_a_step_not_the_run(views, monkeypatch):
     assert all(torch.isfinite(p).all() for p in net.parameters())
 
 
+@pytest.mark.filterwarnings("ignore:Detected call of")  # the scheduler, before any step was taken
 def test_a_run_that_has_diverged_says_so(views, monkeypatch):
     loss = training._loss
     monkeypatch.setattr(training, "_loss", lambda *inputs: loss(*inputs) * torch.nan)
