@@ -1,8 +1,8 @@
 """Opens every page of the built book in headless Chromium: `make site`.
 
 Light and dark, wide and narrow. No page may ask another host for anything, nor log an error, nor
-be wider than the screen; every 3D figure must be drawn, and turn under the mouse. Pictures of all
-pages are left in _build/shots.
+be wider than the screen; on a phone the menu must open; every 3D figure must be drawn, turn under
+the mouse and play. Pictures of all pages are left in _build/shots.
 """
 
 import http.server
@@ -65,6 +65,9 @@ def test_page(browser, address, name, theme, width):
     SHOTS.mkdir(parents=True, exist_ok=True)
     page.evaluate("scrollTo(0, 0)")
     page.screenshot(path=SHOTS / f"{Path(name).stem}-{theme}-{width}.png", full_page=True)
+    if width < 600:
+        page.click(".primary-toggle:visible")
+        page.wait_for_selector("nav.bd-links:visible")  # the menu opens
     overflow = page.evaluate("document.documentElement.scrollWidth - innerWidth")
     page.close()
     assert not foreign, foreign
