@@ -1,7 +1,7 @@
 """Cameras: random ones, projection, and the nearest camera to a 3×2 matrix.
 
 A camera is a (3, 2) matrix M with orthonormal columns, MᵀM = I₂. A shape S (P, 3) is seen as
-W = S M + t (paper, eq. 6).
+W = S M + t (paper, eq. 9).
 """
 
 import numpy as np

@@ -42,7 +42,7 @@ def block_soft_threshold(Z, tau, *, exact=True):
     tau : float or (K,) tensor, at least 0
     exact : bool
         True: each block keeps its direction and loses τ of its length, ``Z_k max(0, 1 − τ/‖Z_k‖_F)``.
-        False: soft threshold on every entry (paper, eq. 14), which can also turn a block.
+        False: soft threshold on every entry (paper, eq. 18), which can also turn a block.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def block_ista(D, W, lam, visible=None, *, exact=True, steps=1000, step=None, to
 
     Returns
     -------
-    Z : (B, K, 3, 2) (paper, eqs. 11 to 15 and the masked form in the section on occlusion; chapters 04, 11)
+    Z : (B, K, 3, 2) (paper, eqs. 15 to 19 and the masked form in the section on occlusion; chapters 04, 11)
 
     Raises
     ------
