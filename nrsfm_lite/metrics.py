@@ -58,6 +58,54 @@ def normalized_error(S, S_true, *, scale=True, reflections=True):
     return np.linalg.norm(S - S_true, axis=(1, 2)) / np.linalg.norm(S_true, axis=(1, 2))
 
 
+def e3d(S, S_true):
+    """The classical normalised mean 3D error per frame, with one alignment for all frames.
+
+    Both sets are centred per frame. One orthogonal matrix, the polar factor of the least-squares map
+    from all predicted points to all true ones, is applied to every frame; a mirror image is allowed.
+    Distances per point are then divided by σ, the mean standard deviation of the true coordinates
+    over frames and axes. No scale is fitted. Unlike `normalized_error` this punishes frames that are
+    turned against each other; the two are never comparable (Akhter et al., 2009; Dai et al., 2014).
+
+    Parameters
+    ----------
+    S, S_true : (F, P, 3) arrays or tensors
+
+    Returns
+    -------
+    (F,) array; papers print its mean.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or a value is not finite, or if a true shape has all points equal.
+    """
+    S, S_true = _pair(S, S_true)
+    S, S_true = S - S.mean(1, keepdims=True), S_true - S_true.mean(1, keepdims=True)
+    linear = np.linalg.lstsq(S.reshape(-1, 3), S_true.reshape(-1, 3), rcond=None)[0]
+    U, _, Vh = np.linalg.svd(linear)
+    sigma = S_true.std(axis=1).mean()
+    return np.linalg.norm(S @ (U @ Vh) - S_true, axis=2).mean(1) / sigma
+
+
+def cumulative_error(errors, at=None):
+    """Share of frames whose error is at most a value: the curve that says more than a mean.
+
+    Parameters
+    ----------
+    errors : (F,) array
+    at : (n,) array, optional
+        Values at which to count. Default: 200 values from 0 to the largest error.
+
+    Returns
+    -------
+    at, share : two (n,) arrays; `share` rises from 0 to 1.
+    """
+    errors = np.sort(np.asarray(errors, float))
+    at = np.linspace(0, errors[-1], 200) if at is None else np.asarray(at, float)
+    return at, np.searchsorted(errors, at, side="right") / len(errors)
+
+
 def handedness(S, S_true):
     """Share of frames whose handedness disagrees with the majority's.
 
