@@ -9,8 +9,7 @@ import torch
 
 def visible_mean(W, visible):
     """Mean of the visible points of each frame: (B, P, 2), (B, P) bool -> (B, 2)."""
-    weight = visible[..., None].to(W.dtype)
-    return (torch.where(visible[..., None], W, 0.0) * weight).sum(1) / weight.sum(1).clamp(min=1)
+    return torch.where(visible[..., None], W, 0.0).sum(1) / visible.sum(1, keepdim=True).clamp(min=1)
 
 
 def center(W, visible):
