@@ -79,10 +79,7 @@ def _reconstruct(arguments):
     if arguments.save:
         print(f"wrote {rec.save(arguments.save)}")
     if arguments.out:
-        truth = data.points3d
-        figure = plotting.show3d(rec, truth=truth, max_frames=150, title=arguments.file.name, height=700)
-        plotting.write_html(figure, arguments.out)
-        print(f"wrote {arguments.out}")
+        _write_scene(rec, arguments, truth=data.points3d)
 
 
 def _check_targets(*targets):
@@ -118,7 +115,11 @@ def _load(arguments):
 def _view(arguments):
     _check_targets(arguments.out)
     rec = Reconstruction.load(arguments.file)
-    figure = plotting.show3d(rec, max_frames=150, title=arguments.file.name, height=700)
+    _write_scene(rec, arguments)
+
+
+def _write_scene(rec, arguments, truth=None):
+    figure = plotting.show3d(rec, truth=truth, max_frames=150, title=arguments.file.name, height=700)
     plotting.write_html(figure, arguments.out)
     print(f"wrote {arguments.out}")
 

@@ -59,7 +59,6 @@ def reconstruct(
     """
     W, visible, names, edges = as_points(W, visible)
     W, visible = torch.as_tensor(W), torch.as_tensor(visible)
-    preprocessing.check_extent(W, visible)
     if model is None:
         config = Config(n_points=W.shape[1], projection=projection)
         model = fit(W, visible, config, steps=steps, seed=seed, device=device, progress=progress, checkpoint=checkpoint)
@@ -67,6 +66,8 @@ def reconstruct(
         raise ValueError(f"model was trained for {model.config.n_points} points, but W has {W.shape[1]}.")
     elif model.config.projection != projection:
         raise ValueError(f"model was trained for projection={model.config.projection!r}, not {projection!r}.")
+    else:
+        preprocessing.check_extent(W, visible)  # `fit` has checked its own frames
     with use_threads(1):  # as in `fit`: never slow on a busy machine, and the same result everywhere
         parts = [infer(model, w, v, refine) for w, v in zip(W.split(_CHUNK), visible.split(_CHUNK), strict=True)]
     S, M, t = (np.concatenate([part[i].numpy() for part in parts]) for i in range(3))

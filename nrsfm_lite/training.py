@@ -101,6 +101,8 @@ def fit(
         For arrays of wrong shape, visible points that are not finite, too few frames or points, a
         frame with no visible point or all of them at one place, an unknown schedule, or a checkpoint
         that belongs to other data or settings.
+    FileNotFoundError
+        If the folder of the checkpoint does not exist.
     FloatingPointError
         If 100 steps in a row have no finite gradient.
     """
@@ -138,7 +140,7 @@ def fit(
     optimizers = _optimizers(net, plan)
     decay = _warmup_cosine(steps) if plan.optimizer == "muon" else _exponential
     rates = [torch.optim.lr_scheduler.LambdaLR(o, decay) for o in optimizers]
-    key = _fingerprint(config, plan, steps, seed, X, visible)
+    key = _fingerprint(config, plan, steps, seed, X, visible) if checkpoint else None
     first = _resume(checkpoint, key, net, optimizers, rates, random)
 
     running, skipped = None, 0
@@ -159,7 +161,9 @@ def fit(
                     optimizer.step()
                 running = loss.item() if running is None else 0.98 * running + 0.02 * loss.item()
                 bar.set_postfix(loss=f"{running:.4f}", refresh=False)
-            skipped = 0 if torch.isfinite(norm) else skipped + 1
+                skipped = 0
+            else:
+                skipped += 1
             if skipped == 100:
                 raise FloatingPointError(f"training has diverged: no finite gradient since step {step - 99}.")
             for rate in rates:
