@@ -111,8 +111,8 @@ def show2d(W, edges=None, frames=None, *, visible=None, columns=6):
     middle = np.nanmean(W[frames], axis=1)
     reach = 1.1 * np.nanmax(np.abs(W[frames] - middle[:, None]))
     for axis, f, (x, y) in zip(axes[0], frames, middle, strict=True):
-        _draw2d(axis, W[f], edges, SEEN)
-        axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach), aspect="equal", xticks=[], yticks=[])
+        draw2d(axis, W[f], edges, SEEN)
+        axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach))
         axis.set_title(f"frame {f}", fontsize=9)
         axis.spines[:].set(color=TRUE, visible=True)
     return figure
@@ -147,10 +147,17 @@ def compare(rec, truth, frames=None, *, columns=5):
         line[0].set_ylabel(title, color=INK)
         for i, axis in enumerate(line):
             for points, colour in layers:
-                _draw2d(axis, points[i], truth.edges, colour)
-            axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal", xticks=[], yticks=[])
-            axis.spines[:].set_visible(False)
+                draw2d(axis, points[i], truth.edges, colour)
+            axis.set(xlim=(-reach, reach), ylim=(-reach, reach))
     return figure
+
+
+def draw2d(axis, points, edges, colour, label=None):
+    """One stick figure, points (P, 2), on a matplotlib axis; NaN points are left out."""
+    axis.plot(*_segments(points, edges).T, color=colour, lw=1.5, label=label)
+    axis.plot(*points.T, ".", color=colour, ms=4)
+    axis.set(aspect="equal", xticks=[], yticks=[])
+    axis.spines[:].set_visible(False)
 
 
 def write_html(figure, path):
@@ -170,11 +177,6 @@ def write_html(figure, path):
 def _spread(n_frames, at_most):
     """Indices of frames, evenly spread from the first to the last."""
     return np.linspace(0, n_frames - 1, min(n_frames, at_most)).round().astype(int)
-
-
-def _draw2d(axis, points, edges, colour):
-    axis.plot(*_segments(points, edges).T, color=colour, lw=1.5)
-    axis.plot(*points.T, ".", color=colour, ms=4)
 
 
 def _points(source, argument):
