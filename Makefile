@@ -24,9 +24,10 @@ lab: $(READY)    ## open the notebooks in JupyterLab
 	@echo "Opening JupyterLab …"
 	@$(BIN)/jupyter lab notebooks
 
-bench: $(READY)  ## time a training step and inference on this machine
+bench: $(READY)  ## time a training step and inference on this machine, into _build/bench
 	@echo "Timing …"
-	@$(BIN)/python -m nrsfm_lite.experiments.speed
+	@rm -rf _build/bench
+	@$(BIN)/nrsfm experiment speed --out _build/bench
 
 site: $(READY)   ## look at the built book in headless Chromium (needs chromium; keeps pictures in _build/shots)
 	@echo "Opening every page of _build/html …"

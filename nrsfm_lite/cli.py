@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from . import __version__, datasets, metrics, plotting
+from . import __version__, datasets, experiments, metrics, plotting
 from .data import Reconstruction
 from .reconstruction import reconstruct
 
@@ -56,6 +56,16 @@ def _parser():
     view.add_argument("file", type=Path, metavar="RESULT.npz")
     view.add_argument("--out", type=Path, required=True, metavar="SCENE.html")
     view.set_defaults(run=_view)
+
+    experiment = commands.add_parser(
+        "experiment",
+        help="repeat a measurement of the book",
+        description="Make results/NAME.csv and results/NAME.json. A run that was stopped goes on where it was.",
+    )
+    experiment.add_argument("name", metavar="NAME", choices=experiments.NAMES, help=", ".join(experiments.NAMES))
+    experiment.add_argument("--quick", action="store_true", help="a short form, into _build/results")
+    experiment.add_argument("--out", type=Path, metavar="FOLDER", help="another folder for the results")
+    experiment.set_defaults(run=_experiment)
     return parser
 
 
@@ -116,6 +126,10 @@ def _view(arguments):
     _check_targets(arguments.out)
     rec = Reconstruction.load(arguments.file)
     _write_scene(rec, arguments)
+
+
+def _experiment(arguments):
+    experiments.run(arguments.name, quick=arguments.quick, folder=arguments.out)
 
 
 def _write_scene(rec, arguments, truth=None):

@@ -30,6 +30,10 @@ class Config:
     beta : "full" or "shared"
         How the sparse code is read off the last blocks. "shared": one weight per entry of a block
         (paper, eq. 24). "full": a linear map of all entries of all blocks (the authors' code).
+    threshold : "relu" or "soft"
+        η of every layer. "relu": max(x − b, 0), codes of at least zero and a free b, as the paper runs
+        it. "soft": the soft threshold, blocks of both signs and b ≥ 0, as the paper derives it; the
+        code is then read off in magnitude, for a reason that chapter 09 gives.
     output_bias : bool
         Add a learned mean shape S̄ (the authors' code) to the last, linear layer.
     projection : "orthographic" or "weak_perspective"
@@ -46,6 +50,7 @@ class Config:
     first_atoms: int = 125
     last_atoms: int = 10
     beta: str = "full"
+    threshold: str = "relu"
     output_bias: bool = True
     projection: str = "orthographic"
 
@@ -61,7 +66,11 @@ class Config:
                 f"first_atoms={self.first_atoms}, last_atoms={self.last_atoms}; "
                 "expected first_atoms >= last_atoms >= 2."
             )
-        for key, options in [("beta", ("full", "shared")), ("projection", ("orthographic", "weak_perspective"))]:
+        for key, options in [
+            ("beta", ("full", "shared")),
+            ("threshold", ("relu", "soft")),
+            ("projection", ("orthographic", "weak_perspective")),
+        ]:
             if getattr(self, key) not in options:
                 raise ValueError(f"{key}={getattr(self, key)!r}; expected one of {', '.join(options)}.")
 
@@ -130,22 +139,31 @@ class DeepNRSfM(nn.Module):
         B, P, _ = X.shape
         D1 = self.D[0].permute(1, 2, 0).reshape(P, -1)  # (P, 3 K₁)
         Z = X.mT.reshape(2 * B, P) @ D1  # (2B, 3 K₁)
-        Z = torch.relu(Z.view(6 * B, -1) - self.encoder_threshold[0])  # (6B, K₁)
+        Z = self._threshold(Z.view(6 * B, -1), self.encoder_threshold[0])  # (6B, K₁)
         for D, b in zip(list(self.D)[1:], list(self.encoder_threshold)[1:], strict=True):
-            Z = torch.relu(torch.addmm(-b, Z, D))  # (6B, K_i)
+            Z = self._threshold(Z @ D, b)  # (6B, K_i)
         return Z.view(B, 2, 3, -1)
+
+    def _threshold(self, x, b):
+        """η(x; b), one threshold per atom."""
+        above = torch.relu(x - b)
+        return above if self.config.threshold == "relu" else above - torch.relu(-x - b)
 
     def bottleneck(self, Psi):
         """Sparse code and camera of Psi_N (B, 2, 3, K): psi (B, K) and M (B, 3, 2), orthonormal."""
         B, _, _, K = Psi.shape
         full = self.config.beta == "full"
         psi = Psi.reshape(B, 6 * K) @ self.beta if full else self.beta @ Psi.reshape(B, 6, K)
+        if self.config.threshold == "soft":
+            # The picture turned by 180°, −W, shows the same shape. With odd thresholds every block changes
+            # its sign, and so does M, as it must; the code must not (chapter 09).
+            psi = psi.abs()
         return psi, nearest_orthonormal((Psi @ self.gamma).mT)
 
     def decode(self, psi):
         """Shape of a sparse code, in normalised units: (B, K_N) -> (B, P, 3)."""
         for D, b in zip(list(self.D)[:0:-1], list(self.decoder_threshold)[::-1], strict=True):
-            psi = torch.relu(torch.addmm(-b, psi, D.mT))  # (B, K_{i-1})
+            psi = self._threshold(psi @ D.mT, b)  # (B, K_{i-1})
         S = psi @ self.D[0].flatten(1)  # (B, 3P)
         return S.view(-1, *self.output_bias.shape) + self.output_bias
 

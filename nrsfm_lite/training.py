@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from . import preprocessing
 from .data import as_points
+from .gradient import backpropagate
 from .model import Config, DeepNRSfM
 
 MIN_FRAMES = 10
@@ -137,7 +138,8 @@ def fit(
     size = X.flatten(1).norm(dim=1)
     net.to(device)
     visible = visible.to(device)
-    optimizers = _optimizers(net, plan)
+    complete = bool(visible.all())
+    optimizers = make_optimizers(net, plan)
     decay = _warmup_cosine(steps) if plan.optimizer == "muon" else _exponential
     rates = [torch.optim.lr_scheduler.LambdaLR(o, decay) for o in optimizers]
     key = _fingerprint(config, plan, steps, seed, X, visible) if checkpoint else None
@@ -151,14 +153,14 @@ def fit(
             batch = X[pick]
             if step < plan.turn * steps:
                 batch = batch @ _turns(len(pick), random).to(device)
-            loss = _loss(net, batch, visible[pick], size[pick])
-            for optimizer in optimizers:
-                optimizer.zero_grad()
-            loss.backward()
+            loss = backpropagate(net, batch, None if complete else visible[pick], size[pick])
             norm = torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
             if torch.isfinite(norm):  # a camera one step from degenerate can ask for an infinite step
                 for optimizer in optimizers:
                     optimizer.step()
+                if config.threshold == "soft":
+                    for b in (*net.encoder_threshold, *net.decoder_threshold):
+                        b.data.clamp_(min=0)
                 running = loss.item() if running is None else 0.98 * running + 0.02 * loss.item()
                 bar.set_postfix(loss=f"{running:.4f}", refresh=False)
                 skipped = 0
@@ -170,14 +172,9 @@ def fit(
                 rate.step()
             if checkpoint and ((step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == steps):
                 _save(checkpoint, key, step + 1, net, optimizers, rates, random)
+    for p in net.parameters():
+        p.data = p.data.clone()  # no longer a piece of the optimiser's vector
     return net.cpu().eval()
-
-
-def _loss(net, X, visible, size):
-    """Mean over frames of ‖W − S M‖_F / ‖W‖_F, visible points only."""
-    psi, M = net.bottleneck(net.encode(X))
-    residual = (X - net.decode(psi) @ M) * visible[..., None]
-    return (residual.flatten(1).norm(dim=1) / size).mean()
 
 
 def _turns(n, random):
@@ -187,13 +184,28 @@ def _turns(n, random):
     return torch.stack([c, -s, s, c], 1).view(n, 2, 2)
 
 
-def _optimizers(net, plan):
+class FlatAdam(torch.optim.Adam):
+    """Fused Adam on one long vector of which the parameters are pieces: one update instead of forty."""
+
+    def __init__(self, parameters, rate):
+        self.pieces = [p for p in parameters if p.requires_grad]
+        flat = torch.nn.Parameter(torch.cat([p.detach().flatten() for p in self.pieces]))
+        for p, piece in zip(self.pieces, flat.detach().split([p.numel() for p in self.pieces]), strict=True):
+            p.data = piece.view_as(p)
+        super().__init__([flat], rate, fused=True)
+
+    def step(self):
+        self.param_groups[0]["params"][0].grad = torch.cat([p.grad.flatten() for p in self.pieces])
+        super().step()
+
+
+def make_optimizers(net, plan):
+    """The optimisers of a `Schedule` for a network; the network must already be where it is trained."""
     if plan.optimizer == "adam":
-        return [torch.optim.Adam(net.parameters(), plan.rate, fused=True)]
+        return [FlatAdam(net.parameters(), plan.rate)]
     inner = list(net.D)[1:]
     chosen = {id(p) for p in inner}
-    rest = [p for p in net.parameters() if id(p) not in chosen]
-    adam = torch.optim.Adam(rest, plan.rate, fused=True)
+    adam = FlatAdam([p for p in net.parameters() if id(p) not in chosen], plan.rate)
     return [torch.optim.Muon(inner, plan.muon_rate, weight_decay=plan.muon_decay), adam] if inner else [adam]
 
 

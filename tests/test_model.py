@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import nrsfm_lite as nl
+from nrsfm_lite.experiments.convolution import ConvolutionNet
 
 
 @pytest.fixture
@@ -65,6 +66,47 @@ def test_shared_beta_is_one_weight_per_entry_of_a_block(W):
     torch.testing.assert_close(psi, torch.einsum("ji,bjik->bk", net.beta.view(2, 3), Psi))
 
 
+def test_soft_thresholds_keep_both_signs_and_read_the_code_in_magnitude(W):
+    net = nl.DeepNRSfM(nl.Config(5, 3, 9, 4, threshold="soft")).double()
+    with torch.no_grad():
+        for b in net.encoder_threshold:
+            b.fill_(0.05)
+    Psi = net.encode(W)
+    torch.testing.assert_close(net.encode(-W), -Psi)
+    D1 = torch.cat(list(net.D[0]), dim=1)
+    first = nl.sparse_coding.block_soft_threshold((D1.T @ W).view(6, 9, 3, 2), 0.05, exact=False)
+    layer = nl.DeepNRSfM(nl.Config(5, 1, 9, 9, threshold="soft")).double()
+    with torch.no_grad():
+        layer.D[0].copy_(net.D[0])
+        layer.encoder_threshold[0].fill_(0.05)
+    torch.testing.assert_close(layer.encode(W).permute(0, 3, 2, 1), first)
+    (psi, M), (turned, M_turned) = net.bottleneck(Psi), net.bottleneck(-Psi)
+    torch.testing.assert_close((turned, M_turned), (psi, -M))  # a picture on its head: same shape
+
+
+@pytest.mark.parametrize("dtype, rtol", [(torch.float, 1e-5), (torch.double, 1e-10)])
+def test_the_convolution_form_is_the_same_function(dtype, rtol):
+    g = torch.Generator().manual_seed(0)
+    net = nl.DeepNRSfM(nl.Config(31), generator=g)
+    with torch.no_grad():
+        for D in list(net.D)[1:]:
+            D *= 2  # else the codes of twelve layers die out
+        for p in [*net.encoder_threshold, *net.decoder_threshold, net.output_bias]:
+            p.normal_(0, 0.02, generator=g)
+    net = net.to(dtype)
+    conv = ConvolutionNet(net)
+    X = torch.randn(8, 31, 2, dtype=dtype, generator=g)
+    psi, M = net.bottleneck(net.encode(X))
+    S = net.decode(psi)
+    S2, M2 = conv(X)
+    weights = torch.randn(8, 31, 2, dtype=dtype, generator=g)
+    ours = torch.autograd.grad(((S @ M) * weights).sum(), list(net.D))
+    theirs = torch.autograd.grad(((S2 @ M2) * weights).sum(), list(conv.kernels))
+    theirs = [theirs[0][..., 0].permute(1, 0, 2), *(k[..., 0, 0] for k in theirs[1:])]
+    for a, b in zip((S, M, *ours), (S2, M2, *theirs), strict=True):
+        assert (a - b).abs().max() <= rtol * b.abs().max()
+
+
 def test_output_is_orthonormal_centred_and_reprojects_best(net, W):
     S, M, t = net(W)
     torch.testing.assert_close(M.mT @ M, torch.eye(2, dtype=torch.double).expand(6, 2, 2))
@@ -118,6 +160,7 @@ def test_to_arrays_and_back(net, W):
         ({"n_points": 5, "n_dictionaries": 0}, "n_dictionaries is 0"),
         ({"n_points": 5, "first_atoms": 4, "last_atoms": 8}, "first_atoms=4"),
         ({"n_points": 5, "beta": "none"}, "beta='none'"),
+        ({"n_points": 5, "threshold": "hard"}, "threshold='hard'"),
         ({"n_points": 5, "projection": "fisheye"}, "projection='fisheye'"),
     ],
 )

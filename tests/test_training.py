@@ -46,17 +46,17 @@ def test_interrupted_training_resumes_to_the_same_result(views, schedule, tmp_pa
 
     whole = train()
     monkeypatch.setattr(training, "_CHECKPOINT_EVERY", 15)
-    loss, calls = training._loss, iter(range(25))
+    backpropagate, calls = training.backpropagate, iter(range(25))
 
     def interrupted(*inputs):
         if next(calls, None) is None:
             raise KeyboardInterrupt
-        return loss(*inputs)
+        return backpropagate(*inputs)
 
-    monkeypatch.setattr(training, "_loss", interrupted)
+    monkeypatch.setattr(training, "backpropagate", interrupted)
     with pytest.raises(KeyboardInterrupt):
         train(checkpoint=tmp_path / "state.pt")
-    monkeypatch.setattr(training, "_loss", loss)
+    monkeypatch.setattr(training, "backpropagate", backpropagate)
     resumed = train(checkpoint=tmp_path / "state.pt")
     for a, b in zip(whole.parameters(), resumed.parameters(), strict=True):
         assert torch.equal(a, b)
@@ -66,7 +66,7 @@ def test_interrupted_training_resumes_to_the_same_result(views, schedule, tmp_pa
 def test_a_finished_checkpoint_trains_no_more(views, tmp_path, monkeypatch):
     train = {"steps": 10, "progress": False, "checkpoint": tmp_path / "state.pt"}
     first = nl.fit(views.points2d, None, SMALL, **train)
-    monkeypatch.setattr(training, "_loss", None)  # would raise if called
+    monkeypatch.setattr(training, "backpropagate", None)  # would raise if called
     again = nl.fit(views.points2d, None, SMALL, **train)
     assert torch.equal(first.D[0], again.D[0])
 
@@ -92,21 +92,26 @@ def test_degenerate_frames_do_not_turn_the_loss_nan():
 
 
 def test_a_nonfinite_gradient_costs_a_step_not_the_run(views, monkeypatch):
-    loss, calls = training._loss, iter([False] * 5 + [True] + [False] * 20)
+    backpropagate, calls = training.backpropagate, iter([False] * 5 + [True] + [False] * 20)
 
     def sometimes_infinite(net, *inputs):
-        value = loss(net, *inputs)
-        return value * torch.inf if next(calls) else value
+        loss = backpropagate(net, *inputs)
+        if next(calls):
+            net.gamma.grad.fill_(torch.inf)
+        return loss
 
-    monkeypatch.setattr(training, "_loss", sometimes_infinite)
+    monkeypatch.setattr(training, "backpropagate", sometimes_infinite)
     net = nl.fit(views.points2d, None, SMALL, steps=20, progress=False)
     assert all(torch.isfinite(p).all() for p in net.parameters())
 
 
 @pytest.mark.filterwarnings("ignore:Detected call of")  # the scheduler, before any step was taken
 def test_a_run_that_has_diverged_says_so(views, monkeypatch):
-    loss = training._loss
-    monkeypatch.setattr(training, "_loss", lambda *inputs: loss(*inputs) * torch.nan)
+    def not_a_number(net, *inputs):
+        net.gamma.grad = torch.full_like(net.gamma, torch.nan)
+        return torch.tensor(torch.nan)
+
+    monkeypatch.setattr(training, "backpropagate", not_a_number)
     with pytest.raises(FloatingPointError, match="no finite gradient since step 0"):
         nl.fit(views.points2d, None, SMALL, steps=200, progress=False)
 

@@ -1,1 +1,5 @@
-"""The paper's tables and figures as runnable experiments, and the timing of the package itself."""
+"""The measurements of the book, as experiments that anyone can repeat: `nrsfm experiment NAME`."""
+
+from .runner import NAMES, run
+
+__all__ = ["NAMES", "run"]

@@ -1,0 +1,81 @@
+"""What the experiments measure on, and how a network is scored: the same everywhere."""
+
+import hashlib
+import os
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from .. import datasets, metrics
+from ..reconstruction import reconstruct
+from ..training import fit
+
+_CMU = ("salsa", "indian", "martial")
+
+
+@lru_cache(maxsize=4)
+def load(name):
+    """Landmarks with points3d: "motion", "motion-small", or a folder of `cmu_bvh`, "martial", "salsa" or "indian".
+
+    Raises FileNotFoundError, with a sentence, if real data is asked for and NRSFM_DATA does not lead to it.
+    """
+    if name == "motion":
+        return datasets.make_motion(4000, seed=0)
+    if name == "motion-small":
+        return datasets.make_motion(600, seed=0)
+    if name not in _CMU:
+        raise KeyError(f"unknown data {name!r}; there are motion, motion-small, {', '.join(_CMU)}.")
+    folder = Path(os.environ.get("NRSFM_DATA", Path.home() / ".cache/nrsfm_lite")) / "cmu_bvh" / name
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder; set NRSFM_DATA to a folder that holds cmu_bvh/{name}.")
+    return datasets.load_bvh(folder, joints=datasets.CMU_BODY)
+
+
+def describe(name):
+    """Frames, points and a hash of the 3D points, so that a result can be traced to its data."""
+    data = load(name)
+    digest = hashlib.sha256(np.ascontiguousarray(data.points3d, dtype=np.float32).tobytes()).hexdigest()
+    return {"frames": len(data), "points": data.n_points, "sha256": digest[:16]}
+
+
+def score(data, config, seed, steps=None):
+    """Train on the first 80 % of the sequences and measure on those and on the rest.
+
+    One random orthographic camera per frame, the same for every seed of the training. The truth is
+    used to measure, and nowhere else.
+
+    Returns
+    -------
+    dict with `image` (mean relative reprojection error), `seen` and `unseen` (mean normalised 3D error of
+    training and other frames, one forward pass), `refined` and `refined_unseen` (after the per-frame
+    refinement), `other_hand` (share of frames of the other handedness) and `coherence` (of the last dictionary).
+    """
+    train, test = datasets.make_views(load(data), seed=0).split()
+    net = fit(train, config=config, seed=seed, steps=steps, progress=False)
+    result = {}
+    for label, views in (("seen", train), ("unseen", test)):
+        plain = reconstruct(views, model=net, refine=False)
+        result[label] = metrics.normalized_error(plain.shapes, views.points3d).mean()
+        refined = reconstruct(views, model=net)
+        key = "refined" if label == "seen" else "refined_unseen"
+        result[key] = metrics.normalized_error(refined.shapes, views.points3d).mean()
+        if label == "seen":
+            size = np.linalg.norm(views.points2d, axis=(1, 2))
+            result["image"] = (np.linalg.norm(plain.projections - views.points2d, axis=(1, 2)) / size).mean()
+            result["other_hand"] = metrics.handedness(refined.shapes, views.points3d)
+    return {k: float(v) for k, v in result.items()} | {"coherence": net.coherence}
+
+
+def compare(rows, setting):
+    """Mean and spread over seeds of the errors, for each data set and value of one setting, as text."""
+    lines = []
+    groups = dict.fromkeys((r["data"], r[setting]) for r in rows)
+    for data, value in groups:
+        chosen = [r for r in rows if (r["data"], r[setting]) == (data, value)]
+        parts = []
+        for key in ("image", "refined", "refined_unseen"):
+            numbers = np.array([float(r[key]) for r in chosen])
+            parts.append(f"{key} {numbers.mean():.4f} ± {numbers.std(ddof=1) if len(numbers) > 1 else 0:.4f}")
+        lines.append(f"{data}, {setting} {value}, {len(chosen)} seeds: " + ", ".join(parts))
+    return "\n".join(lines)
