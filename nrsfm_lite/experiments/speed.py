@@ -66,12 +66,14 @@ def measure(device, threads, batch):
 
 def report(rows):
     """The ratios, one line per case."""
-    lines = [
-        f"{r['device']:4s} {r['threads']} threads, batch {r['batch']:>4s}: step {float(r['step_ms']):7.2f} ms, "
-        f"{float(r['step_over_floor']):.2f} times the floor; convolutions "
-        f"{float(r['convolution_over_step']):.2f} times the step; inference {float(r['inference_frames_per_s']):8.0f} frames/s"
-        for r in rows
-    ]
+    lines = []
+    for r in rows:
+        floor, convolution = float(r["step_over_floor"]), float(r["convolution_over_step"])
+        lines.append(
+            f"{r['device']:4s} {r['threads']} threads, batch {r['batch']:>4s}: step {float(r['step_ms']):7.2f} ms, "
+            f"{floor:.2f} times the floor; convolutions take {convolution:.2f} times as long; "
+            f"inference {float(r['inference_frames_per_s']):8.0f} frames/s"
+        )
     return "\n".join(lines)
 
 
