@@ -5,6 +5,7 @@ Shapes in comments: B frames, P points, K_i atoms of dictionary i, N dictionarie
 
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -171,7 +172,7 @@ class DeepNRSfM(nn.Module):
         """Centred, scaled points with zeros where hidden; and each frame's scale (B,)."""
         X, _ = preprocessing.center(W, visible)
         if self.config.projection == "orthographic":
-            scale = self.scale.expand(len(X))
+            scale = self.scale.expand(X.shape[0])  # not len(X), which `torch.export` would fix
         else:
             scale = preprocessing.frame_scale(X, visible)
         return X / scale[:, None, None], scale
@@ -197,6 +198,42 @@ class DeepNRSfM(nn.Module):
         S = (S - S.mean(1, keepdim=True)) * scale[:, None, None]
         t = preprocessing.visible_mean(W - S @ M, visible)  # the best t in closed form
         return S, M, t
+
+    def save(self, path):
+        """Write configuration and weights to one file that holds no code; returns its path."""
+        path = Path(path)
+        weights = {key: value.detach().cpu() for key, value in self.state_dict().items()}
+        torch.save({"config": asdict(self.config), "weights": weights}, path)
+        return path
+
+    @classmethod
+    def load(cls, path):
+        """The network that `save` wrote, on the CPU and in evaluation mode.
+
+        Raises FileNotFoundError if there is no such file, ValueError if it is not a saved network.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such file.")
+        try:
+            saved = torch.load(path, weights_only=True, map_location="cpu")
+            return cls.from_arrays(saved["config"], saved["weights"])
+        except Exception as error:  # torch raises many kinds for a broken file
+            raise ValueError(f"{path}: not a saved network, or a broken one ({type(error).__name__}).") from None
+
+    def to_onnx(self, path):
+        """Write the forward pass as ONNX, for any number of frames: W and visible in; S, M and t out.
+
+        Needs the packages onnx and onnxscript (``pip install nrsfm-lite[onnx]``). Returns the path.
+        """
+        W = torch.zeros(2, self.config.n_points, 2, dtype=self.scale.dtype, device=self.scale.device)
+        W[:, 0, 0], W[:, 1, 1] = 1, 1  # any two frames that are not a point
+        visible = torch.ones(W.shape[:2], dtype=torch.bool, device=W.device)
+        frames = {0: torch.export.Dim("frames", min=1)}
+        program = torch.export.export(self, (W, visible), dynamic_shapes=(frames, frames))
+        names = {"input_names": ["W", "visible"], "output_names": ["S", "M", "t"]}
+        torch.onnx.export(program, dynamo=True, verbose=False, **names).save(str(path))
+        return Path(path)
 
     def to_arrays(self):
         """(config, weights) as a dict and a dict of NumPy arrays: all that `from_arrays` needs."""

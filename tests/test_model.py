@@ -84,8 +84,33 @@ def test_soft_thresholds_keep_both_signs_and_read_the_code_in_magnitude(W):
     torch.testing.assert_close((turned, M_turned), (psi, -M))  # a picture on its head: same shape
 
 
-@pytest.mark.parametrize("dtype, rtol", [(torch.float, 1e-5), (torch.double, 1e-10)])
-def test_the_convolution_form_is_the_same_function(dtype, rtol):
+def kronecker_form(net, X):
+    """Shapes and cameras with every Kronecker product formed, frame by frame, and an SVD."""
+    ones, eye = torch.ones(3, 2, dtype=X.dtype), torch.eye(3, dtype=X.dtype)
+    first = torch.cat(list(net.D[0]), dim=1)  # D1#: (P, 3 K1)
+    shapes, cameras = [], []
+    for x in X:
+        Psi = torch.relu(first.T @ x - torch.kron(net.encoder_threshold[0][:, None], ones))
+        for D, b in zip(list(net.D)[1:], list(net.encoder_threshold)[1:], strict=True):
+            Psi = torch.relu(torch.kron(D, eye).T @ Psi - torch.kron(b[:, None], ones))
+        blocks = Psi.view(-1, 3, 2)  # (K_N, 3, 2)
+        U, _, Vh = torch.linalg.svd(torch.einsum("kij,k->ij", blocks, net.gamma), full_matrices=False)
+        psi = blocks.permute(2, 1, 0).flatten() @ net.beta
+        for D, b in zip(list(net.D)[:0:-1], list(net.decoder_threshold)[::-1], strict=True):
+            psi = torch.relu(D @ psi - b)
+        S = first @ torch.kron(psi[:, None], eye)  # D1# (psi kron I3)
+        shapes.append(S + net.output_bias)
+        cameras.append(U @ Vh)
+    return torch.stack(shapes), torch.stack(cameras)
+
+
+def package_form(net, X):
+    psi, M = net.bottleneck(net.encode(X))
+    return net.decode(psi), M
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float, 1e-5), (torch.double, 1e-10)])
+def test_kronecker_convolution_and_matrix_products_are_one_function(dtype, rtol):
     g = torch.Generator().manual_seed(0)
     net = nl.DeepNRSfM(nl.Config(31), generator=g)
     with torch.no_grad():
@@ -95,16 +120,20 @@ def test_the_convolution_form_is_the_same_function(dtype, rtol):
             p.normal_(0, 0.02, generator=g)
     net = net.to(dtype)
     conv = ConvolutionNet(net)
-    X = torch.randn(8, 31, 2, dtype=dtype, generator=g)
-    psi, M = net.bottleneck(net.encode(X))
-    S = net.decode(psi)
-    S2, M2 = conv(X)
-    weights = torch.randn(8, 31, 2, dtype=dtype, generator=g)
-    ours = torch.autograd.grad(((S @ M) * weights).sum(), list(net.D))
-    theirs = torch.autograd.grad(((S2 @ M2) * weights).sum(), list(conv.kernels))
-    theirs = [theirs[0][..., 0].permute(1, 0, 2), *(k[..., 0, 0] for k in theirs[1:])]
-    for a, b in zip((S, M, *ours), (S2, M2, *theirs), strict=True):
-        assert (a - b).abs().max() <= rtol * b.abs().max()
+    X, weights = torch.randn(2, 8, 31, 2, dtype=dtype, generator=g)
+    results = {}
+    for name, (S, M), kernels in [
+        ("products", package_form(net, X), list(net.D)),
+        ("kronecker", kronecker_form(net, X), list(net.D)),
+        ("convolution", conv(X), list(conv.kernels)),
+    ]:
+        gradients = torch.autograd.grad(((S @ M) * weights).sum(), kernels)
+        if name == "convolution":
+            gradients = [gradients[0][..., 0].permute(1, 0, 2), *(k[..., 0, 0] for k in gradients[1:])]
+        results[name] = (S, M, *gradients)
+    for name in ("kronecker", "convolution"):
+        for a, b in zip(results["products"], results[name], strict=True):
+            assert (a - b).norm() <= rtol * b.norm(), name
 
 
 def test_output_is_orthonormal_centred_and_reprojects_best(net, W):
@@ -172,3 +201,50 @@ def test_wrong_settings_are_refused(settings, message):
 def test_a_network_needs_its_number_of_points():
     with pytest.raises(ValueError, match="n_points or a Config"):
         nl.DeepNRSfM()
+
+
+def test_names_and_shapes_of_the_weights_are_stable():
+    """Files saved today must load tomorrow."""
+    shapes = {k: tuple(v.shape) for k, v in nl.DeepNRSfM(nl.Config(5, 3, 8, 4)).state_dict().items()}
+    assert shapes == {
+        "beta": (24, 4), "gamma": (4,), "output_bias": (5, 3), "scale": (),
+        "D.0": (8, 5, 3), "D.1": (8, 6), "D.2": (6, 4),
+        "encoder_threshold.0": (8,), "encoder_threshold.1": (6,), "encoder_threshold.2": (4,),
+        "decoder_threshold.0": (8,), "decoder_threshold.1": (6,),
+    }  # fmt: skip
+
+
+def test_save_and_load(net, W, tmp_path):
+    net.scale.fill_(2.0)
+    again = nl.DeepNRSfM.load(net.save(tmp_path / "net.pt"))
+    assert again.config == net.config and not again.training
+    for a, b in zip(again(W), net(W), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_what_is_not_a_network_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        nl.DeepNRSfM.load(tmp_path / "none.pt")
+    (tmp_path / "text.pt").write_text("hello")
+    torch.save({"config": {"n_points": 5}, "weights": {}}, tmp_path / "empty.pt")
+    for name in ("text.pt", "empty.pt"):
+        with pytest.raises(ValueError, match="not a saved network"):
+            nl.DeepNRSfM.load(tmp_path / name)
+
+
+@pytest.mark.filterwarnings("ignore")  # of the exporter's own making
+@pytest.mark.parametrize("settings", [{}, {"threshold": "soft", "beta": "shared", "projection": "weak_perspective"}])
+def test_onnx_is_the_same_function_for_any_number_of_frames(settings, tmp_path):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    g = torch.Generator().manual_seed(0)
+    net = nl.DeepNRSfM(nl.Config(5, 3, 12, 4, **settings), generator=g)
+    net.scale.fill_(3.0)
+    session = onnxruntime.InferenceSession(str(net.to_onnx(tmp_path / "net.onnx")))
+    for frames in (1, 7):
+        W = 10 * torch.randn(frames, 5, 2, generator=g) + 100
+        visible = torch.rand(frames, 5, generator=g) > 0.2
+        visible[:, :3] = True
+        got = session.run(["S", "M", "t"], {"W": W.numpy(), "visible": visible.numpy()})
+        with torch.no_grad():
+            for a, b in zip(got, net(W, visible), strict=True):
+                np.testing.assert_allclose(a, b.numpy(), rtol=1e-4, atol=1e-4)
