@@ -69,8 +69,11 @@ def reconstruct(
     else:
         preprocessing.check_extent(W, visible)  # `fit` has checked its own frames
     with use_threads(1):  # as in `fit`: never slow on a busy machine, and the same result everywhere
-        parts = [infer(model, w, v, refine) for w, v in zip(W.split(_CHUNK), visible.split(_CHUNK), strict=True)]
-    S, M, t = (np.concatenate([part[i].numpy() for part in parts]) for i in range(3))
+        F, P, _ = W.shape
+        S, M, t = np.empty((F, P, 3)), np.empty((F, 3, 2)), np.empty((F, 2))
+        for first in range(0, F, _CHUNK):
+            part = slice(first, first + _CHUNK)
+            S[part], M[part], t[part] = infer(model, W[part], visible[part], refine)
     return Reconstruction(
         shapes=S,
         cameras=M,

@@ -131,7 +131,7 @@ def fit(
     preprocessing.check_extent(W, visible)
     seed = int(seed)
     random = torch.Generator().manual_seed(seed)
-    net = DeepNRSfM(config, generator=random)
+    net = DeepNRSfM(config, generator=random).float()
     X, _ = preprocessing.center(W, visible)
     net.scale.fill_(preprocessing.set_scale(X, visible))
     X = net.normalize(W, visible)[0].float().to(device)
@@ -152,7 +152,7 @@ def fit(
             pick = torch.randint(F, (min(plan.batch, F),), generator=random).to(device)
             batch = X[pick]
             if step < plan.turn * steps:
-                batch = batch @ _turns(len(pick), random).to(device)
+                batch = batch @ _turns(len(pick), random).to(batch)
             loss = backpropagate(net, batch, None if complete else visible[pick], size[pick])
             norm = torch.nn.utils.clip_grad_norm_(net.parameters(), 1.0)
             if torch.isfinite(norm):  # a camera one step from degenerate can ask for an infinite step

@@ -162,3 +162,13 @@ def one_place():
 def test_wrong_input_is_refused(W, more, message):
     with pytest.raises(ValueError, match=message):
         nl.fit(W, progress=False, **more)
+
+
+def test_the_callers_default_dtype_does_not_matter(views):
+    expected = nl.fit(views, config=SMALL, steps=5, progress=False)
+    torch.set_default_dtype(torch.double)
+    try:
+        net = nl.fit(views, config=SMALL, steps=5, progress=False)
+    finally:
+        torch.set_default_dtype(torch.float)
+    assert net.D[0].dtype == expected.D[0].dtype == torch.float

@@ -26,7 +26,7 @@ import torch
 
 from . import material
 
-NAMES = ("speed", "thresholds", "relaxation")
+NAMES = ("speed", "inference", "thresholds", "relaxation")
 _LIBRARIES = ("torch", "numpy", "scipy")
 
 

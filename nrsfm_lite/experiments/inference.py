@@ -1,0 +1,66 @@
+"""How fast a trained network takes in many frames, and whether its memory stays flat."""
+
+import multiprocessing
+import resource
+import sys
+import time
+
+import numpy as np
+
+from ..model import DeepNRSfM
+from ..reconstruction import reconstruct
+
+QUESTION = "How many frames per second does `reconstruct` take in with a trained network, and how much memory?"
+_POINTS = 31
+
+
+def cases(quick):
+    """Number of frames, with and without the refinement of each frame."""
+    return [{"frames": n, "refine": r} for r in (False, True) for n in ((1000,) if quick else (10_000, 100_000))]
+
+
+def conditions(quick):
+    """What all cases share."""
+    return {
+        "network": "the default, 31 points, float32; its weights do not matter for the time",
+        "work_mb": "growth of the peak memory during the call, less the arrays it returns; a fresh process per case",
+    }
+
+
+def measure(frames, refine):
+    """Seconds and megabytes, measured in a process of its own, since a peak never goes down again."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    child = context.Process(target=_child, args=(theirs, frames, refine))
+    child.start()
+    theirs.close()
+    result = ours.recv()
+    child.join()
+    return result
+
+
+def report(rows):
+    """One line per case."""
+    return "\n".join(
+        f"{int(r['frames']):7d} frames, refine={r['refine']}: {float(r['frames_per_s']):8.0f} frames/s, "
+        f"{float(r['work_mb']):.0f} MB to work with, {float(r['peak_mb']):.0f} MB in all"
+        for r in rows
+    )
+
+
+def _child(pipe, frames, refine):
+    W = np.random.default_rng(0).normal(size=(frames, _POINTS, 2))
+    net = DeepNRSfM(n_points=_POINTS).eval()
+    reconstruct(W[:100], model=net, refine=refine)  # libraries load on first use
+    before = _peak_mb()
+    start = time.perf_counter()
+    rec = reconstruct(W, model=net, refine=refine)
+    seconds = time.perf_counter() - start
+    returned = sum(a.nbytes for a in (rec.shapes, rec.cameras, rec.translations, rec.visible)) / 1e6
+    peak = _peak_mb()
+    pipe.send({"frames_per_s": frames / seconds, "work_mb": peak - before - returned, "peak_mb": peak})
+
+
+def _peak_mb():
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
