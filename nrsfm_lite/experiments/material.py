@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from .. import datasets, metrics
+from ..model import Config
 from ..reconstruction import reconstruct
 from ..training import fit
 
 _CMU = ("salsa", "indian", "martial")
+_QUICK_STEPS = 60
 
 
 @lru_cache(maxsize=4)
@@ -67,8 +69,24 @@ def score(data, config, seed, steps=None):
     return {k: float(v) for k, v in result.items()} | {"coherence": net.coherence}
 
 
-def compare(rows, setting):
-    """Mean and spread over seeds of the errors, for each data set and value of one setting, as text."""
+def variants(setting, values, seeds, quick):
+    """Cases of an experiment that compares the values of one setting of the network over seeds."""
+    data, seeds = (["motion-small"], 1) if quick else (["motion", "martial"], seeds)
+    return [{"data": d, setting: v, "seed": s} for d in data for v in values for s in range(seeds)]
+
+
+def variant_conditions(setting, quick):
+    """What the cases of `variants` share."""
+    return {"network": f"the default, but for {setting}", "steps": _QUICK_STEPS if quick else "the default schedule's"}
+
+
+def score_variant(data, seed, **setting):
+    """`score` of the default network with one setting changed."""
+    return score(data, Config(load(data).n_points, **setting), seed, _QUICK_STEPS if data == "motion-small" else None)
+
+
+def compare_variants(setting, rows):
+    """Mean and spread over seeds of the errors, for each data set and value of the setting, as text."""
     lines = []
     groups = dict.fromkeys((r["data"], r[setting]) for r in rows)
     for data, value in groups:
