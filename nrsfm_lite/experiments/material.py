@@ -34,6 +34,7 @@ def load(name):
     return datasets.load_bvh(folder, joints=datasets.CMU_BODY)
 
 
+@lru_cache
 def describe(name):
     """Frames, points and a hash of the 3D points, so that a result can be traced to its data."""
     data = load(name)

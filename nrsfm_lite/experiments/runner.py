@@ -63,12 +63,13 @@ def run(name, quick=False, folder=None, say=print):
     if name not in NAMES:
         raise KeyError(f"unknown experiment {name!r}; there are {', '.join(NAMES)}.")
     experiment = importlib.import_module(f".{name}", __package__)
-    cases = [{key: _text(value) for key, value in case.items()} for case in experiment.cases(quick)]
+    asked = experiment.cases(quick)
+    cases = [{key: _text(value) for key, value in case.items()} for case in asked]
     folder = Path(folder or ("_build/results" if quick else "results"))
     table, origin = folder / f"{name}.csv", folder / f"{name}.json"
     rows = _read(table, cases)
     done = _keys(rows, cases)
-    todo = [(key, case) for key, case in zip(cases, experiment.cases(quick), strict=True) if key not in done]
+    todo = [(key, case) for key, case in zip(cases, asked, strict=True) if key not in done]
     say(f"{name}: {experiment.QUESTION}")
     say(f"{len(cases)} cases, {len(cases) - len(todo)} done before, results in {table}")
     folder.mkdir(parents=True, exist_ok=True)
