@@ -7,7 +7,7 @@ rec = nl.reconstruct(views)
 nl.metrics.normalized_error(rec.shapes, data.points3d).mean()
 """
 
-from . import baselines, cameras, datasets, experiments, metrics, plotting, sparse_coding
+from . import baselines, cameras, datasets, experiments, metrics, plotting, quality, sparse_coding
 from .data import Landmarks, Reconstruction
 from .model import Config, DeepNRSfM
 from .reconstruction import reconstruct
@@ -17,5 +17,6 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Config", "DeepNRSfM", "Landmarks", "Reconstruction", "baselines", "cameras", "datasets",
-    "experiments", "fit", "metrics", "plotting", "reconstruct", "sparse_coding",
+    "experiments", "fit", "metrics", "plotting", "quality", "reconstruct",
+    "sparse_coding",
 ]  # fmt: skip

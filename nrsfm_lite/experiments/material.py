@@ -2,12 +2,13 @@
 
 import hashlib
 import os
+import time
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
-from .. import datasets, metrics
+from .. import datasets, metrics, quality
 from ..model import Config
 from ..reconstruction import reconstruct
 from ..training import fit
@@ -42,7 +43,7 @@ def describe(name):
     return {"frames": len(data), "points": data.n_points, "sha256": digest[:16]}
 
 
-def score(data, config, seed, steps=None):
+def score(data, seed, config=None, schedule="default", steps=None, threads=1, checkpoint=None):
     """Train on the first 80 % of the sequences and measure on those and on the rest.
 
     One random orthographic camera per frame, the same for every seed of the training. The truth is
@@ -50,24 +51,30 @@ def score(data, config, seed, steps=None):
 
     Returns
     -------
-    dict with `image` (mean relative reprojection error), `seen` and `unseen` (mean normalised 3D error of
-    training and other frames, one forward pass), `refined` and `refined_unseen` (after the per-frame
-    refinement), `other_hand` (share of frames of the other handedness) and `coherence` (of the last dictionary).
+    dict with `train_seconds`, all of `quality.scores` on the training frames, `image_unseen` (`image_error` of
+    the other frames), `seen` and `unseen` (mean normalised 3D error of training and other frames, one forward
+    pass), `refined` and `refined_unseen` (after the per-frame refinement), and `other_hand` (share of training
+    frames of the other handedness).
     """
-    train, test = datasets.make_views(load(data), seed=0).split()
-    net = fit(train, config=config, seed=seed, steps=steps, progress=False)
-    result = {}
-    for label, views in (("seen", train), ("unseen", test)):
-        plain = reconstruct(views, model=net, refine=False)
-        result[label] = metrics.normalized_error(plain.shapes, views.points3d).mean()
-        refined = reconstruct(views, model=net)
-        key = "refined" if label == "seen" else "refined_unseen"
-        result[key] = metrics.normalized_error(refined.shapes, views.points3d).mean()
-        if label == "seen":
-            size = np.linalg.norm(views.points2d, axis=(1, 2))
-            result["image"] = (np.linalg.norm(plain.projections - views.points2d, axis=(1, 2)) / size).mean()
-            result["other_hand"] = metrics.handedness(refined.shapes, views.points3d)
-    return {k: float(v) for k, v in result.items()} | {"coherence": net.coherence}
+    train, test = views(data)
+    start = time.perf_counter()
+    options = {"schedule": schedule, "steps": steps, "threads": threads, "checkpoint": checkpoint}
+    net = fit(train, config=config, seed=seed, progress=False, **options)
+    result = {"train_seconds": time.perf_counter() - start}
+    result |= quality.scores(net, train) | {"image_unseen": quality.image_error(net, test)}
+    for label, frames in (("", train), ("_unseen", test)):
+        plain = reconstruct(frames, model=net, refine=False)
+        result[label[1:] or "seen"] = metrics.normalized_error(plain.shapes, frames.points3d).mean()
+        refined = reconstruct(frames, model=net)
+        result["refined" + label] = metrics.normalized_error(refined.shapes, frames.points3d).mean()
+        if not label:
+            result["other_hand"] = metrics.handedness(refined.shapes, frames.points3d)
+    return {k: float(v) for k, v in result.items()}
+
+
+def views(data):
+    """Training and unseen frames, each under its own random camera."""
+    return datasets.make_views(load(data), seed=0).split()
 
 
 def variants(setting, values, seeds, quick):
@@ -83,7 +90,8 @@ def variant_conditions(setting, quick):
 
 def score_variant(data, seed, **setting):
     """`score` of the default network with one setting changed."""
-    return score(data, Config(load(data).n_points, **setting), seed, _QUICK_STEPS if data == "motion-small" else None)
+    config = Config(load(data).n_points, **setting)
+    return score(data, seed, config, steps=_QUICK_STEPS if data == "motion-small" else None)
 
 
 def compare_variants(setting, rows):
@@ -93,7 +101,7 @@ def compare_variants(setting, rows):
     for data, value in groups:
         chosen = [r for r in rows if (r["data"], r[setting]) == (data, value)]
         parts = []
-        for key in ("image", "refined", "refined_unseen"):
+        for key in ("image_error", "refined", "refined_unseen"):
             numbers = np.array([float(r[key]) for r in chosen])
             parts.append(f"{key} {numbers.mean():.4f} ± {numbers.std(ddof=1) if len(numbers) > 1 else 0:.4f}")
         lines.append(f"{data}, {setting} {value}, {len(chosen)} seeds: " + ", ".join(parts))

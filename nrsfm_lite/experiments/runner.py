@@ -26,7 +26,7 @@ import torch
 
 from . import material
 
-NAMES = ("speed", "inference", "thresholds", "relaxation")
+NAMES = ("speed", "inference", "thresholds", "relaxation", "training")
 _LIBRARIES = ("torch", "numpy", "scipy")
 
 

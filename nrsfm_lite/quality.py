@@ -1,0 +1,105 @@
+"""How good a trained network is, judged without any 3D (chapter 10).
+
+Every score looks at a network and at images, never at a true shape. Lower is better for all but
+`code_dimension`, where neither direction is better by itself. `coherence` of the last dictionary, the
+paper's own measure, is a property of the model.
+"""
+
+import numpy as np
+import torch
+
+from .cameras import random_cameras
+from .data import as_points
+
+
+def scores(model, W, visible=None, seed=0):
+    """Every score of this module for some frames, and the model's coherence.
+
+    Parameters
+    ----------
+    model : DeepNRSfM
+    W : Landmarks, or (F, P, 2) array or tensor
+    visible : (F, P) bool, optional
+    seed : int
+        Decides the new cameras of `consistency` and the turns of `turn_consistency`.
+
+    Returns
+    -------
+    dict of floats: coherence, image_error, consistency, turn_consistency, distortion, code_dimension.
+    """
+    return {
+        "coherence": model.coherence,
+        "image_error": image_error(model, W, visible),
+        "consistency": consistency(model, W, visible, seed),
+        "turn_consistency": turn_consistency(model, W, visible, seed),
+        "distortion": distortion(model, W, visible),
+        "code_dimension": code_dimension(model, W, visible),
+    }
+
+
+@torch.no_grad()
+def image_error(model, W, visible=None):
+    """Mean over frames of ‖W − S M‖ / ‖W‖ over the visible points: the training loss of one forward pass."""
+    X, seen = _normalized(model, W, visible)
+    S, M, _ = _forward(model, X)
+    missed = torch.where(seen[..., None], X - S @ M, 0.0).flatten(1).norm(dim=1)
+    return float((missed / X.flatten(1).norm(dim=1)).mean())
+
+
+@torch.no_grad()
+def consistency(model, W, visible=None, seed=0):
+    """Does a reconstruction survive a photograph from elsewhere?
+
+    Each reconstructed shape is seen by a new random camera, and the network reconstructs that image. Mean
+    over frames of ‖S' − S‖ / ‖S‖, in the network's own coordinates, so that a turned or mirrored answer
+    counts as an error.
+    """
+    S, _, _ = _forward(model, _normalized(model, W, visible)[0])
+    cameras = torch.as_tensor(random_cameras(len(S), seed)).to(S)
+    again, _, _ = _forward(model, S @ cameras)
+    return _relative(again, S)
+
+
+@torch.no_grad()
+def turn_consistency(model, W, visible=None, seed=0):
+    """Is an image, turned in its plane by a random angle, given the same shape? Mean of ‖S' − S‖ / ‖S‖."""
+    X, _ = _normalized(model, W, visible)
+    angle = torch.as_tensor(np.random.default_rng(seed).uniform(0, 2 * np.pi, len(X))).to(X)
+    turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(-1, 2, 2)
+    S, _, _ = _forward(model, X)
+    again, _, _ = _forward(model, X @ turn)
+    return _relative(again, S)
+
+
+@torch.no_grad()
+def distortion(model, W, visible=None):
+    """How far the cameras are from orthonormal before the projection makes them so: mean (σ₁ − σ₂) / (σ₁ + σ₂)."""
+    A = (model.encode(_normalized(model, W, visible)[0]) @ model.gamma).mT
+    sigma = torch.linalg.svdvals(A)  # (B, 2)
+    return float(((sigma[:, 0] - sigma[:, 1]) / sigma.sum(1).clamp(min=1e-12)).mean())
+
+
+@torch.no_grad()
+def code_dimension(model, W, visible=None):
+    """In how many directions the codes spread: (Σλ)² / Σλ² of the eigenvalues of their covariance."""
+    _, _, psi = _forward(model, _normalized(model, W, visible)[0])
+    values = torch.linalg.eigvalsh(torch.cov(psi.double().T)).clamp(min=0)
+    return float(values.sum() ** 2 / values.square().sum().clamp(min=1e-300))
+
+
+def _normalized(model, W, visible):
+    W, visible, _, _ = as_points(W, visible)
+    W, visible = torch.as_tensor(W), torch.as_tensor(visible)
+    return model.normalize(W, visible)[0].to(model.gamma.dtype), visible
+
+
+def _forward(model, X):
+    """Centred shapes, cameras and codes in the network's units."""
+    psi, M = model.bottleneck(model.encode(X))
+    S = model.decode(psi)
+    return S - S.mean(1, keepdim=True), M, psi
+
+
+def _relative(S, reference):
+    size = reference.flatten(1).norm(dim=1).clamp(min=1e-12)
+    return float(((S - reference).flatten(1).norm(dim=1) / size).mean())
