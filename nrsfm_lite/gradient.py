@@ -13,7 +13,7 @@ _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
 
 @torch.no_grad()
-def backpropagate(net, X, visible=None, size=None):
+def backpropagate(net, X, visible=None, size=None, pull=0.0):
     """The training loss of a batch (paper, eq. 27); its gradient is left in the parameters' ``.grad``.
 
     ``mean_f ‖Ω (W_f − S_f M_f)‖_F / size_f``, with the network's shape and camera of each frame.
@@ -27,10 +27,12 @@ def backpropagate(net, X, visible=None, size=None):
         Default: everything.
     size : (B,) tensor, optional
         Default: ‖X_f‖_F, as in the authors' code. Ones give the paper's own loss.
+    pull : float
+        Weight of a second term, ``mean_f ‖S_f − S̄‖_F / size_f``, which draws shapes to the mean shape S̄.
 
     Returns
     -------
-    Scalar tensor.
+    Scalar tensor: the loss without the pull.
     """
     B, P, _ = X.shape
     size = X.flatten(1).norm(dim=1) if size is None else size
@@ -65,6 +67,9 @@ def backpropagate(net, X, visible=None, size=None):
     gM = S.mT @ g
     g = (g @ M.mT).view(B, -1)
     _set(net.output_bias, g.sum(0).view(P, 3))
+    if pull:
+        away = (S - net.output_bias).view(B, -1)
+        g.addcmul_(away, (pull / (B * size * away.norm(dim=1).clamp(min=1e-12)))[:, None])
     dD0 = (decoded[-1].mT @ g).view_as(D0)
     g = g @ D0.view(len(D0), -1).mT
     dD = []

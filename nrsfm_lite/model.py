@@ -13,6 +13,7 @@ from torch import nn
 
 from . import preprocessing
 from .cameras import nearest_orthonormal
+from .shape_prior import ShapePrior
 from .sparse_coding import mutual_coherence
 
 
@@ -86,9 +87,10 @@ class DeepNRSfM(nn.Module):
 
     ``DeepNRSfM(n_points=31)`` takes the defaults, ``DeepNRSfM(Config(...))`` any setting. The
     parameters carry the names of the paper: `D` (list of dictionaries), `encoder_threshold`,
-    `decoder_threshold`, `beta`, `gamma`, `output_bias`. `scale` is a buffer: the unit of length that
-    `fit` found, so that results come back in the user's units. The weights start Glorot-uniform as in
-    the authors' code, drawn from `generator`; thresholds and S̄ start at zero.
+    `decoder_threshold`, `beta`, `gamma`, `output_bias`. What `fit` finds besides is kept in buffers: `scale`,
+    the unit of length, so that results come back in the user's units, and the shape prior (`prior`).
+    The weights start Glorot-uniform as in the authors' code, drawn from `generator`; thresholds and S̄
+    start at zero.
     """
 
     def __init__(self, config=None, *, n_points=None, generator=None):
@@ -110,6 +112,9 @@ class DeepNRSfM(nn.Module):
         self.gamma = nn.Parameter(torch.empty(K[-1]))
         self.output_bias = nn.Parameter(torch.zeros(P, 3), requires_grad=config.output_bias)
         self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("prior_mean", torch.zeros(P, 3))
+        self.register_buffer("prior_covariance", torch.zeros(3 * P, 3 * P))
+        self.register_buffer("prior_noise", torch.zeros(()))
         self._draw_weights(generator)
 
     def _draw_weights(self, generator):
@@ -130,6 +135,20 @@ class DeepNRSfM(nn.Module):
         """Mutual coherence of the last dictionary, a quality measure that needs no truth (chapter 10)."""
         D = self.D[-1]
         return mutual_coherence(D if D.ndim == 2 else D.flatten(1).T)
+
+    @property
+    def prior(self):
+        """The `ShapePrior` that `fit` learned with the network, or None. To be set to a ShapePrior."""
+        if self.prior_noise == 0:
+            return None
+        C = self.prior_covariance.double().cpu()
+        return ShapePrior(self.prior_mean.double().cpu(), C, self.prior_noise.item())
+
+    @prior.setter
+    def prior(self, prior):
+        self.prior_mean.copy_(prior.mean)
+        self.prior_covariance.copy_(prior.covariance)
+        self.prior_noise.fill_(prior.noise)
 
     def encode(self, X):
         """Block sparse code of normalised points: (B, P, 2) -> Psi_N (B, 2, 3, K_N).
@@ -244,5 +263,6 @@ class DeepNRSfM(nn.Module):
         """The network that `to_arrays` took apart."""
         weights = {k: torch.as_tensor(v) for k, v in weights.items()}
         net = cls(Config(**config), generator=torch.Generator()).to(weights["scale"].dtype)
-        net.load_state_dict(weights)
+        older = {k: v for k, v in net.state_dict().items() if k.startswith("prior_")}  # files once had no prior
+        net.load_state_dict(older | weights)
         return net.eval()

@@ -8,6 +8,7 @@ paper's own measure, is a property of the model.
 import numpy as np
 import torch
 
+from . import shape_prior
 from .cameras import random_cameras
 from .data import as_points
 
@@ -25,7 +26,7 @@ def scores(model, W, visible=None, seed=0):
 
     Returns
     -------
-    dict of floats: coherence, image_error, consistency, turn_consistency, distortion, code_dimension.
+    dict of floats: coherence, image_error, consistency, turn_consistency, distortion, code_dimension, surprise.
     """
     return {
         "coherence": model.coherence,
@@ -34,6 +35,7 @@ def scores(model, W, visible=None, seed=0):
         "turn_consistency": turn_consistency(model, W, visible, seed),
         "distortion": distortion(model, W, visible),
         "code_dimension": code_dimension(model, W, visible),
+        "surprise": surprise(model, W, visible),
     }
 
 
@@ -85,6 +87,20 @@ def code_dimension(model, W, visible=None):
     _, _, psi = _forward(model, _normalized(model, W, visible)[0])
     values = torch.linalg.eigvalsh(torch.cov(psi.double().T)).clamp(min=0)
     return float(values.sum() ** 2 / values.square().sum().clamp(min=1e-300))
+
+
+@torch.no_grad()
+def surprise(model, W, visible=None):
+    """−log p(image) per visible coordinate under the model's shape prior, with refined cameras; NaN without a prior.
+
+    The unit of length is the network's.
+    """
+    if model.prior is None:
+        return float("nan")
+    X, visible = _normalized(model, W, visible)
+    _, M, _ = _forward(model, X)
+    _, M = shape_prior.apply(model.prior, X, visible, M)
+    return shape_prior.surprise(model.prior, X, visible, M)
 
 
 def _normalized(model, W, visible):

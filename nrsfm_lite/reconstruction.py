@@ -3,11 +3,12 @@
 import numpy as np
 import torch
 
-from . import preprocessing
+from . import preprocessing, shape_prior
 from .cameras import nearest_orthonormal
 from .data import Reconstruction, as_points
 from .model import Config
-from .training import fit, use_threads
+from .shape_prior import ShapePrior
+from .training import fit, learn_prior, use_threads
 
 _CHUNK = 4096  # frames per pass: memory stays flat in the number of frames
 _REFINE_STEPS = 150
@@ -21,6 +22,7 @@ def reconstruct(
     steps=None,
     projection="orthographic",
     refine=True,
+    adapt=False,
     seed=0,
     device=None,
     progress=True,
@@ -28,8 +30,8 @@ def reconstruct(
 ):
     """3D shapes and cameras of 2D landmarks, without any 3D supervision.
 
-    Trains a network on the frames (or takes a trained one), infers every frame's code and camera,
-    and fits both to the frame's own points with the dictionaries held fixed.
+    Trains a network on the frames (or takes a trained one), infers every frame's shape and camera, and
+    refines both with the prior over shapes that was learned with the network.
 
     Parameters
     ----------
@@ -43,8 +45,14 @@ def reconstruct(
         Training steps. Default: those of the default schedule.
     projection : "orthographic" or "weak_perspective"
         One scale for all frames, or one per frame that goes into the shape.
-    refine : bool
-        Fit each frame's code and camera after the network's guess. False: one forward pass.
+    refine : True, "code" or False
+        True: the most probable shape of each frame under the model's `ShapePrior`, with the camera fitted
+        to it from the network's guess. "code": code and camera fitted to the frame's points by gradient
+        descent, dictionaries fixed. False: one forward pass of the network.
+    adapt : bool
+        Learn the shape prior from these frames instead of taking the model's; it pays for new motions of
+        some hundred frames or more. Without it, each frame is reconstructed on its own. A model without
+        a prior always learns it here.
     seed, device, progress, checkpoint
         As in `fit`; they concern the training. Inference runs where the model is.
 
@@ -57,6 +65,8 @@ def reconstruct(
     ValueError
         As `fit`; also if `model` was trained for another number of points or another projection.
     """
+    if refine not in (True, False, "code"):
+        raise ValueError(f"refine={refine!r}; expected True, False or 'code'.")
     W, visible, names, edges = as_points(W, visible)
     W, visible = torch.as_tensor(W), torch.as_tensor(visible)
     if model is None:
@@ -69,11 +79,14 @@ def reconstruct(
     else:
         preprocessing.check_extent(W, visible)  # `fit` has checked its own frames
     with use_threads(1):  # as in `fit`: never slow on a busy machine, and the same result everywhere
+        prior = model.prior if refine is True else None
+        if refine is True and (adapt or prior is None):
+            prior = learn_prior(model, model.normalize(W, visible)[0], visible, torch.Generator().manual_seed(seed))
         F, P, _ = W.shape
         S, M, t = np.empty((F, P, 3)), np.empty((F, 3, 2)), np.empty((F, 2))
         for first in range(0, F, _CHUNK):
             part = slice(first, first + _CHUNK)
-            S[part], M[part], t[part] = infer(model, W[part], visible[part], refine)
+            S[part], M[part], t[part] = infer(model, W[part], visible[part], prior or refine)
     return Reconstruction(
         shapes=S,
         cameras=M,
@@ -87,41 +100,38 @@ def reconstruct(
     )
 
 
-def infer(model, W, visible, refine=True):
+def infer(model, W, visible, refine=False):
     """Shapes, cameras and translations of some frames by a trained network, in double precision at the end.
 
     Parameters
     ----------
     model : DeepNRSfM
     W, visible : tensors (B, P, 2) and (B, P) bool
-    refine : bool
-        After the network's guess, fit code and camera of each frame to its visible points by
-        gradient descent, dictionaries fixed: the encoder is one step of block ISTA per layer, and
-        this takes more of them.
+    refine : ShapePrior, "code" or False
+        How to go on from the network's guess.
 
     Returns
     -------
     S (B, P, 3) centred, M (B, 3, 2), t (B, 2): tensors in the units of W.
     """
     device = model.scale.device
-    W, visible = W.to(device), visible.to(device)
-    X, scale = model.normalize(W, visible)
-    X = X.to(model.scale.dtype)
+    X, scale = model.normalize(W.to(device), visible.to(device))
     with torch.no_grad():
-        Psi = model.encode(X)
-        psi, M = model.bottleneck(Psi)
-    if refine:
-        psi, M = _refine(model, X, visible, psi, M)
-    with torch.no_grad():
-        S = model.decode(psi).double()
-        # A float32 camera is orthonormal to 1e-7; once more in double precision costs nothing.
-        M = nearest_orthonormal(M.double())
-    S = (S - S.mean(1, keepdim=True)) * scale[:, None, None].double()
-    t = preprocessing.visible_mean(W - S @ M, visible)
-    return S.cpu(), M.cpu(), t.cpu()
+        psi, M = model.bottleneck(model.encode(X.to(model.scale.dtype)))
+    if isinstance(refine, ShapePrior):
+        S, M = shape_prior.apply(refine, X.cpu(), visible, M.cpu())
+    else:
+        if refine == "code":
+            psi, M = _refine_code(model, X.to(model.scale.dtype), visible.to(device), psi, M)
+        with torch.no_grad():
+            S = model.decode(psi).double().cpu()
+    # A float32 camera is orthonormal to 1e-7; once more in double precision costs nothing.
+    M = nearest_orthonormal(M.detach().double().cpu())
+    S = (S - S.mean(1, keepdim=True)) * scale[:, None, None].double().cpu()
+    return S, M, preprocessing.visible_mean(W - S @ M, visible)
 
 
-def _refine(model, X, visible, psi, M):
+def _refine_code(model, X, visible, psi, M):
     """Code (B, K) and camera (B, 3, 2) after Adam on each frame's reprojection error."""
     weight = visible[..., None].to(X.dtype)
     unit = psi.abs().mean(1, keepdim=True).clamp(min=1e-6)  # codes live on the network's own scale

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from . import preprocessing
+from . import preprocessing, shape_prior
 from .data import as_points
 from .gradient import backpropagate
 from .model import Config, DeepNRSfM
@@ -19,6 +19,7 @@ from .model import Config, DeepNRSfM
 MIN_FRAMES = 10
 MIN_POINTS = 4
 _CHECKPOINT_EVERY = 500  # steps
+_PRIOR_FRAMES = 2000  # more add little
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,9 @@ class Schedule:
     `steps` of `batch` frames each. Optimiser "muon": Muon for the inner dictionaries, Adam for the
     rest, warm-up and cosine; "adam": Adam for all, slowly decaying. `rate` is Adam's peak learning
     rate. For the first `turn` of the steps every image is turned in its plane by a random angle: an
-    orthographic camera may be held at any tilt, so these are new and valid views.
+    orthographic camera may be held at any tilt, so these are new and valid views. `pull` draws shapes to
+    their mean with this weight at first and none from the middle on, so that frames and their mirror
+    images, which explain the same pictures, do not both find a place. `clip`: the longest gradient.
     """
 
     steps: int
@@ -38,12 +41,13 @@ class Schedule:
     muon_rate: float = 0.0
     muon_decay: float = 0.0
     turn: float = 0.0
-    clip: float = math.inf  # longest gradient
+    pull: float = 0.0
+    clip: float = math.inf
 
 
 SCHEDULES = {
     # Found on salsa and on motions of other seeds than those that any figure is reported on.
-    "default": Schedule(2700, 256, "muon", rate=8e-3, muon_rate=2.4e-2, muon_decay=0.1, turn=0.4, clip=1.0),
+    "default": Schedule(800, 256, "muon", rate=8e-3, muon_rate=2.4e-2, muon_decay=0.1, turn=0.4, pull=0.3, clip=1.0),
     # The authors' code: Adam at 1e-3, times 0.95 every 10,000 steps.
     "original": Schedule(200_000, 32, "adam", rate=1e-3),
 }
@@ -62,11 +66,11 @@ def fit(
     checkpoint=None,
     threads=1,
 ):
-    """Train a network on 2D landmarks. No 3D is ever seen, not even that of Landmarks which have it.
+    """Train a network and its shape prior on 2D landmarks. No 3D is seen, not even that of Landmarks with 3D.
 
     The loss is the paper's: the reprojection error ‖W − S M‖_F of each frame over its visible points,
-    divided by ‖W‖_F as in the authors' code. Gradients are clipped to norm 1, and a step whose
-    gradient is not finite is left out.
+    divided by ‖W‖_F as in the authors' code. A step whose gradient is not finite is left out. In the end
+    the network's cameras give a Gaussian prior over shapes (`shape_prior`), which `reconstruct` refines with.
 
     Parameters
     ----------
@@ -154,7 +158,8 @@ def fit(
             batch = X[pick]
             if step < plan.turn * steps:
                 batch = batch @ _turns(len(pick), random).to(batch)
-            loss = backpropagate(net, batch, None if complete else visible[pick], size[pick])
+            pull = plan.pull * max(0.0, 1 - 2 * step / steps)
+            loss = backpropagate(net, batch, None if complete else visible[pick], size[pick], pull)
             norm = torch.nn.utils.clip_grad_norm_(net.parameters(), plan.clip)
             if torch.isfinite(norm):  # a camera one step from degenerate can ask for an infinite step
                 for optimizer in optimizers:
@@ -173,9 +178,30 @@ def fit(
                 rate.step()
             if checkpoint and ((step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == steps):
                 _save(checkpoint, key, step + 1, net, optimizers, rates, random)
-    for p in net.parameters():
-        p.data = p.data.clone()  # no longer a piece of the optimiser's vector
-    return net.cpu().eval()
+        for p in net.parameters():
+            p.data = p.data.clone()  # no longer a piece of the optimiser's vector
+        net.cpu().eval()
+        net.prior = learn_prior(net, X.cpu(), visible.cpu(), random)
+    return net
+
+
+@torch.no_grad()
+def learn_prior(net, X, visible, random=None):
+    """The `ShapePrior` of some frames, from a trained network's shapes and cameras of at most 2,000 of them.
+
+    Parameters
+    ----------
+    net : DeepNRSfM
+    X : (F, P, 2) tensor
+        Normalised points, zero where hidden.
+    visible : (F, P) bool tensor
+    random : torch.Generator, optional
+        Draws the frames.
+    """
+    pick = torch.randperm(len(X), generator=random)[:_PRIOR_FRAMES]
+    X, visible = X[pick], visible[pick]
+    psi, M = net.bottleneck(net.encode(X.to(net.scale)))
+    return shape_prior.learn(X, visible, net.decode(psi).cpu(), M.cpu())
 
 
 def _turns(n, random):

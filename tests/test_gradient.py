@@ -24,11 +24,13 @@ def network(dtype=torch.double, **settings):
     return net
 
 
-def by_autograd(net, X, visible, size):
+def by_autograd(net, X, visible, size, pull=0.0):
     psi, M = net.bottleneck(net.encode(X))
     residual = (X - net.decode(psi) @ M) * visible[..., None]
     loss = (residual.flatten(1).norm(dim=1) / size).mean()
-    return loss, torch.autograd.grad(loss, [p for p in net.parameters() if p.requires_grad])
+    away = (net.decode(psi) - net.output_bias).flatten(1).norm(dim=1) / size
+    objective = loss + pull * away.mean()
+    return loss, torch.autograd.grad(objective, [p for p in net.parameters() if p.requires_grad])
 
 
 @pytest.mark.parametrize("beta", ["full", "shared"])
@@ -50,6 +52,16 @@ def test_the_papers_own_loss_without_bias_in_float32(batch):
     for p, g in zip([p for p in net.parameters() if p.requires_grad], gradients, strict=True):
         torch.testing.assert_close(p.grad, g, rtol=1e-4, atol=1e-6)
     assert net.output_bias.grad is None
+
+
+def test_the_pull_to_the_mean_shape_is_in_the_gradient_only(batch):
+    net = network()
+    X, visible = batch
+    size = X.flatten(1).norm(dim=1)
+    expected, gradients = by_autograd(net, X, visible, size, pull=0.7)
+    torch.testing.assert_close(backpropagate(net, X, visible, size, 0.7), expected.detach())
+    for p, g in zip(net.parameters(), gradients, strict=True):
+        torch.testing.assert_close(p.grad, g, rtol=1e-10, atol=1e-12)
 
 
 def test_one_dictionary(batch):

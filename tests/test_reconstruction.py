@@ -51,6 +51,27 @@ def test_refinement_explains_the_images_better(views, rec):
     np.testing.assert_allclose(plain.cameras, M.detach(), atol=1e-4)
 
 
+def test_each_refinement_is_better_than_none_and_the_prior_is_best(views, rec):
+    def error(**how):
+        again = nl.reconstruct(views, model=rec.model, **how)
+        return nl.metrics.normalized_error(again.shapes, views.points3d).mean()
+
+    with_prior, by_code, plain = error(), error(refine="code"), error(refine=False)
+    assert with_prior < by_code < plain
+    np.testing.assert_allclose(nl.reconstruct(views, model=rec.model).shapes, rec.shapes, atol=1e-3)
+
+
+def test_the_prior_can_be_learned_from_the_new_frames(rec):
+    other = nl.datasets.make_views(nl.datasets.make_motion(400, seed=8), seed=8)
+    errors = {}
+    for adapt in (False, True):
+        again = nl.reconstruct(other, model=rec.model, adapt=adapt)
+        errors[adapt] = nl.metrics.normalized_error(again.shapes, other.points3d).mean()
+    assert errors[True] < errors[False]
+    bare = nl.DeepNRSfM(n_points=31, generator=torch.Generator().manual_seed(0)).eval()
+    assert bare.prior is None and np.isfinite(nl.reconstruct(other, model=bare).shapes).all()
+
+
 def test_a_trained_network_takes_new_frames_of_any_number(rec):
     other = nl.datasets.make_views(nl.datasets.make_motion(50, seed=99))
     again = nl.reconstruct(other, model=rec.model)
@@ -91,6 +112,8 @@ def test_weak_perspective_scale_goes_into_the_shape(views):
 
 
 def test_wrong_input_is_refused(views, rec):
+    with pytest.raises(ValueError, match="refine='codes'; expected True, False or 'code'"):
+        nl.reconstruct(views, model=rec.model, refine="codes")
     with pytest.raises(ValueError, match="no points2d"):
         nl.reconstruct(nl.datasets.make_motion(20))
     with pytest.raises(ValueError, match="at least 10 frames"):

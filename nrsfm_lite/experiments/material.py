@@ -2,7 +2,6 @@
 
 import hashlib
 import os
-import time
 from functools import lru_cache
 from pathlib import Path
 
@@ -43,37 +42,37 @@ def describe(name):
     return {"frames": len(data), "points": data.n_points, "sha256": digest[:16]}
 
 
-def score(data, seed, config=None, schedule="default", steps=None, threads=1, checkpoint=None):
-    """Train on the first 80 % of the sequences and measure on those and on the rest.
-
-    One random orthographic camera per frame, the same for every seed of the training. The truth is
-    used to measure, and nowhere else.
+def score(net, train, test, by_code=True):
+    """Scores and errors of a trained network. The truth is used here, and nowhere else.
 
     Returns
     -------
-    dict with `train_seconds`, all of `quality.scores` on the training frames, `image_unseen` (`image_error` of
-    the other frames), `seen` and `unseen` (mean normalised 3D error of training and other frames, one forward
-    pass), `refined` and `refined_unseen` (after the per-frame refinement), and `other_hand` (share of training
-    frames of the other handedness).
+    dict with all of `quality.scores` on the training frames and `image_unseen` (`image_error` of the other
+    frames), then mean normalised 3D errors of the training frames: `seen` (one forward pass), `by_code`
+    (refined by the code), `refined` (as `reconstruct` does); the same of the other frames, `unseen`,
+    `by_code_unseen`, `refined_unseen`; `adapted_unseen` (the prior learned from them); and `other_hand`,
+    the share of refined training frames of the other handedness.
     """
-    train, test = views(data)
-    start = time.perf_counter()
-    options = {"schedule": schedule, "steps": steps, "threads": threads, "checkpoint": checkpoint}
-    net = fit(train, config=config, seed=seed, progress=False, **options)
-    result = {"train_seconds": time.perf_counter() - start}
-    result |= quality.scores(net, train) | {"image_unseen": quality.image_error(net, test)}
-    for label, frames in (("", train), ("_unseen", test)):
-        plain = reconstruct(frames, model=net, refine=False)
-        result[label[1:] or "seen"] = metrics.normalized_error(plain.shapes, frames.points3d).mean()
-        refined = reconstruct(frames, model=net)
-        result["refined" + label] = metrics.normalized_error(refined.shapes, frames.points3d).mean()
-        if not label:
-            result["other_hand"] = metrics.handedness(refined.shapes, frames.points3d)
-    return {k: float(v) for k, v in result.items()}
+    result = quality.scores(net, train) | {"image_unseen": quality.image_error(net, test)}
+
+    def error(frames, **how):
+        rec = reconstruct(frames, model=net, **how)
+        return float(metrics.normalized_error(rec.shapes, frames.points3d).mean()), rec
+
+    result["seen"], _ = error(train, refine=False)
+    result["unseen"], _ = error(test, refine=False)
+    if by_code:
+        result["by_code"], _ = error(train, refine="code")
+        result["by_code_unseen"], _ = error(test, refine="code")
+    result["refined"], rec = error(train)
+    result["refined_unseen"], _ = error(test)
+    result["adapted_unseen"], _ = error(test, adapt=True)
+    result["other_hand"] = metrics.handedness(rec.shapes, train.points3d)
+    return result
 
 
 def views(data):
-    """Training and unseen frames, each under its own random camera."""
+    """Training frames (the first 80 % of the sequences) and unseen ones, each under its own random camera."""
     return datasets.make_views(load(data), seed=0).split()
 
 
@@ -91,7 +90,9 @@ def variant_conditions(setting, quick):
 def score_variant(data, seed, **setting):
     """`score` of the default network with one setting changed."""
     config = Config(load(data).n_points, **setting)
-    return score(data, seed, config, steps=_QUICK_STEPS if data == "motion-small" else None)
+    train, test = views(data)
+    net = fit(train, config=config, seed=seed, steps=_QUICK_STEPS if data == "motion-small" else None, progress=False)
+    return score(net, train, test)
 
 
 def compare_variants(setting, rows):
@@ -101,7 +102,7 @@ def compare_variants(setting, rows):
     for data, value in groups:
         chosen = [r for r in rows if (r["data"], r[setting]) == (data, value)]
         parts = []
-        for key in ("image_error", "refined", "refined_unseen"):
+        for key in ("image_error", "by_code", "by_code_unseen"):
             numbers = np.array([float(r[key]) for r in chosen])
             parts.append(f"{key} {numbers.mean():.4f} ± {numbers.std(ddof=1) if len(numbers) > 1 else 0:.4f}")
         lines.append(f"{data}, {setting} {value}, {len(chosen)} seeds: " + ", ".join(parts))

@@ -1,25 +1,29 @@
 """The package's schedule beside the authors': time, errors and their spread over seeds (chapter 10)."""
 
+import time
+
 import numpy as np
 
+from ..reconstruction import reconstruct
+from ..training import fit
 from . import material
 
 QUESTION = "How fast and how well does the default schedule train, beside the original one, and over seeds?"
 _SEEDS = {  # (schedule, data): how many seeds
+    ("default", "martial"): 5,
+    ("default", "salsa"): 5,
+    ("default", "motion"): 5,
+    ("default", "indian"): 3,
     ("original", "martial"): 3,
     ("original", "salsa"): 1,
     ("original", "indian"): 1,
     ("original", "motion"): 1,
-    ("default", "martial"): 5,
-    ("default", "salsa"): 5,
-    ("default", "indian"): 3,
-    ("default", "motion"): 5,
 }
 
 
 def cases(quick):
     """Schedule, data and seed."""
-    seeds = {("original", "motion-small"): 1, ("default", "motion-small"): 1} if quick else _SEEDS
+    seeds = {("default", "motion-small"): 1, ("original", "motion-small"): 1} if quick else _SEEDS
     return [{"schedule": s, "data": d, "seed": i} for (s, d), n in seeds.items() for i in range(n)]
 
 
@@ -30,12 +34,20 @@ def conditions(quick):
         "steps": "60" if quick else "the schedule's",
         "threads": 1,
         "frames": "training: the first 80 % of the sequences; unseen: the rest",
+        "time": "train_seconds: fit; refine_seconds: reconstruct of the training frames with the trained network",
     }
 
 
 def measure(schedule, data, seed):
-    """One training, its scores and errors."""
-    return material.score(data, seed, schedule=schedule, steps=60 if data == "motion-small" else None)
+    """One training, its scores and errors, and the time of both halves of `reconstruct`."""
+    train, test = material.views(data)
+    start = time.perf_counter()
+    net = fit(train, schedule=schedule, seed=seed, steps=60 if data == "motion-small" else None, progress=False)
+    train_seconds = time.perf_counter() - start
+    start = time.perf_counter()
+    reconstruct(train, model=net)
+    seconds = {"train_seconds": train_seconds, "refine_seconds": time.perf_counter() - start}
+    return seconds | material.score(net, train, test)
 
 
 def report(rows):
@@ -45,8 +57,8 @@ def report(rows):
         chosen = [r for r in rows if (r["schedule"], r["data"]) == (schedule, data)]
         parts = []
         for key in ("train_seconds", "seen", "refined", "unseen", "refined_unseen"):
-            numbers = np.array([float(r[key]) for r in chosen])
-            parts.append(f"{key} {numbers.mean():.4g} ± {numbers.std(ddof=1) if len(numbers) > 1 else 0:.2g}")
-        worst = max(float(r["refined"]) for r in chosen) / min(float(r["refined"]) for r in chosen)
-        lines.append(f"{schedule:8s} {data:7s} {len(chosen)} seeds: {', '.join(parts)}; worst / best {worst:.2f}")
+            numbers = np.array([float(r[key]) for r in chosen if r[key]])
+            spread = numbers.std(ddof=1) if len(numbers) > 1 else 0
+            parts.append(f"{key} {numbers.mean():.4g} ± {spread:.2g}" if len(numbers) else f"{key} not measured")
+        lines.append(f"{schedule:8s} {data:7s} {len(chosen)} seeds: {', '.join(parts)}")
     return "\n".join(lines)
