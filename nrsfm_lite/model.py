@@ -13,7 +13,7 @@ from torch import nn
 
 from . import preprocessing
 from .cameras import nearest_orthonormal
-from .shape_prior import ShapePrior
+from .shape_prior import KINDS, Gaussian
 from .sparse_coding import mutual_coherence
 
 
@@ -112,9 +112,10 @@ class DeepNRSfM(nn.Module):
         self.gamma = nn.Parameter(torch.empty(K[-1]))
         self.output_bias = nn.Parameter(torch.zeros(P, 3), requires_grad=config.output_bias)
         self.register_buffer("scale", torch.ones(()))
-        self.register_buffer("prior_mean", torch.zeros(P, 3))
-        self.register_buffer("prior_covariance", torch.zeros(3 * P, 3 * P))
-        self.register_buffer("prior_noise", torch.zeros(()))
+        n = 1 + KINDS
+        self.register_buffer("prior_mean", torch.zeros(n, P, 3))
+        self.register_buffer("prior_covariance", torch.zeros(n, 3 * P, 3 * P))
+        self.register_buffer("prior_noise", torch.zeros(n))  # zero: not in use
         self._draw_weights(generator)
 
     def _draw_weights(self, generator):
@@ -138,17 +139,16 @@ class DeepNRSfM(nn.Module):
 
     @property
     def prior(self):
-        """The `ShapePrior` that `fit` learned with the network, or None. To be set to a ShapePrior."""
-        if self.prior_noise == 0:
-            return None
-        C = self.prior_covariance.double().cpu()
-        return ShapePrior(self.prior_mean.double().cpu(), C, self.prior_noise.item())
+        """The shape prior that `fit` learned with the network, a tuple of `shape_prior.Gaussian`, or None."""
+        each = zip(self.prior_mean, self.prior_covariance, self.prior_noise, strict=True)
+        return tuple(Gaussian(m.double().cpu(), C.double().cpu(), s.item()) for m, C, s in each if s > 0) or None
 
     @prior.setter
     def prior(self, prior):
-        self.prior_mean.copy_(prior.mean)
-        self.prior_covariance.copy_(prior.covariance)
-        self.prior_noise.fill_(prior.noise)
+        self.prior_noise.zero_()
+        for i, gaussian in enumerate(prior):
+            self.prior_mean[i], self.prior_covariance[i] = gaussian.mean, gaussian.covariance
+            self.prior_noise[i] = gaussian.noise
 
     def encode(self, X):
         """Block sparse code of normalised points: (B, P, 2) -> Psi_N (B, 2, 3, K_N).

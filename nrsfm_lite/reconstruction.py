@@ -7,7 +7,6 @@ from . import preprocessing, shape_prior
 from .cameras import nearest_orthonormal
 from .data import Reconstruction, as_points
 from .model import Config
-from .shape_prior import ShapePrior
 from .training import fit, learn_prior, use_threads
 
 _CHUNK = 4096  # frames per pass: memory stays flat in the number of frames
@@ -46,7 +45,7 @@ def reconstruct(
     projection : "orthographic" or "weak_perspective"
         One scale for all frames, or one per frame that goes into the shape.
     refine : True, "code" or False
-        True: the most probable shape of each frame under the model's `ShapePrior`, with the camera fitted
+        True: the most probable shape of each frame under the model's shape prior, with the camera fitted
         to it from the network's guess. "code": code and camera fitted to the frame's points by gradient
         descent, dictionaries fixed. False: one forward pass of the network.
     adapt : bool
@@ -107,7 +106,7 @@ def infer(model, W, visible, refine=False):
     ----------
     model : DeepNRSfM
     W, visible : tensors (B, P, 2) and (B, P) bool
-    refine : ShapePrior, "code" or False
+    refine : shape prior (as `shape_prior.learn` returns it), "code" or False
         How to go on from the network's guess.
 
     Returns
@@ -118,7 +117,7 @@ def infer(model, W, visible, refine=False):
     X, scale = model.normalize(W.to(device), visible.to(device))
     with torch.no_grad():
         psi, M = model.bottleneck(model.encode(X.to(model.scale.dtype)))
-    if isinstance(refine, ShapePrior):
+    if isinstance(refine, tuple):
         S, M = shape_prior.apply(refine, X.cpu(), visible, M.cpu())
     else:
         if refine == "code":

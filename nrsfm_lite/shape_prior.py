@@ -1,4 +1,4 @@
-"""A Gaussian prior over shapes, learned from images whose cameras are roughly known (chapter 10).
+"""A prior over shapes, learned from images whose cameras are roughly known (chapter 10).
 
 A trained network puts every frame into one coordinate system, though its shapes are still coarse. From
 there the images themselves tell how shapes vary, because every camera hides another direction. The
@@ -7,9 +7,11 @@ coordinates of all points are taken as one Gaussian vector,
     s ~ N(mean, C),   w = A s + t + noise of variance σ²,   A: what the camera sees, without hidden points,
 
 and expectation maximisation learns mean, C and σ from all frames at once. Torresani, Hertzmann and Bregler
-(2008) do this for a basis of few shapes; here C is whole. Given the prior, a frame's shape is the solution
-of a linear system, hidden points included, and its camera takes a few Newton steps on the likelihood of its
-image, in which the shape has been integrated out.
+(2008) do this for a basis of few shapes; here C is whole. A body that walks and sits is more than one
+Gaussian: the shapes are then sorted into kinds, and each kind gets a Gaussian of its own in the same way.
+
+Given the prior, a frame's shape is the solution of a linear system, hidden points included, and its camera
+takes a few Newton steps on the likelihood of its image, in which the shape has been integrated out.
 
 Shapes in comments: B frames, P points. Points are in the network's units. The coordinates of a shape are
 ordered by axis (all x, all y, all z), so that C has nine P×P blocks and all work is products of matrices.
@@ -19,11 +21,14 @@ import math
 from dataclasses import dataclass
 
 import torch
+from scipy.cluster.vq import kmeans2
 
-_ITERATIONS = 15
-_TURNS = 4  # Newton steps of a frame's camera
+KINDS = 8  # at most
+_FRAMES_PER_KIND = 250  # on average, at least
+_ITERATIONS, _ITERATIONS_OF_A_KIND, _SORTINGS = 15, 6, 2
+_TURNS, _TURNS_IN_A_KIND = 4, 3  # Newton steps of a frame's camera
 _FIRST_NOISE, _LEAST_NOISE = 1e-2, 1e-3  # σ
-_FREEDOM = 1e-3  # variance that C grants every coordinate at the start, beside that of the network's shapes
+_FREEDOM = 1e-2  # variance that C grants every coordinate at the start, beside that of the network's shapes
 _SHIFT = 1.0  # standard deviation of t, which stays zero unless points are hidden
 _LONGEST_TURN = 0.3  # radians per Newton step
 _DAMPING = 3e-3  # of a Newton step, as a share of the mean curvature
@@ -31,8 +36,8 @@ _CHUNK = 64  # frames per pass, so that their matrices stay in the cache
 
 
 @dataclass(frozen=True)
-class ShapePrior:
-    """Gaussian over shapes: mean (P, 3), covariance (3P, 3P) ordered by axis, σ² of the image coordinates."""
+class Gaussian:
+    """Of shapes: mean (P, 3), covariance (3P, 3P) ordered by axis, and the variance σ² of image coordinates."""
 
     mean: torch.Tensor
     covariance: torch.Tensor
@@ -40,7 +45,7 @@ class ShapePrior:
 
 
 def learn(X, visible, S, M):
-    """The prior of a set of frames, by expectation maximisation.
+    """The prior of a set of frames.
 
     Parameters
     ----------
@@ -51,38 +56,33 @@ def learn(X, visible, S, M):
 
     Returns
     -------
-    ShapePrior, in double precision.
+    tuple of Gaussian, in double precision: first that of all shapes; then, if the frames are many enough for
+    two or more, those of up to eight kinds.
     """
-    X, S, M = X.double(), S.double(), M.double().clone()
-    seen = visible.double().repeat(1, 2)  # (B, 2P)
+    X, S, M = X.double(), S.double(), M.double()
     B, P, _ = X.shape
     S = S - S.mean(1, keepdim=True)
-    mean = S.mean(0)
     centred = torch.eye(P, dtype=X.dtype) - 1 / P  # C gives the centroid no variance: that is t's part
-    start = torch.cov((S - mean).mT.flatten(1).T, correction=0)
-    start = start + _FREEDOM * torch.eye(3, dtype=X.dtype).kron(centred)
-    prior = ShapePrior(mean, start, _FIRST_NOISE**2)
-    for _ in range(_ITERATIONS):
-        C, noise = prior.covariance, prior.noise
-        offset, outer, known, rest = 0.0, 0.0, 0.0, 0.0
-        for part in torch.arange(B).split(_CHUNK):
-            post = _look(prior, X[part], seen[part], M[part])
-            d = (post.shapes - prior.mean).mT.flatten(1)  # (b, 3P)
-            offset = offset + d.sum(0)
-            outer = outer + d.T @ d
-            known = known + post.pairs.flatten(0, 1).T @ _split(post.precision).flatten(0, 1)  # Σ Aᵀ Σ⁻¹ A
-            # σ²: what an image misses by, and what is unsure about that
-            rest = rest + noise**2 * (post.weighted.square().sum() - _trace(post.precision)) + noise * seen[part].sum()
-            M[part] = _turn(prior, post, seen[part], M[part])
-        # What the images leave open counts too: each shape's covariance given its image is C − C Aᵀ Σ⁻¹ A C.
-        # One part of the start in B + 1 keeps few frames from a C without variance.
-        offset = offset / B
-        new = C + (outer - C @ _join(known, 3) @ C) / B - torch.outer(offset, offset)
-        new = (B * new + start) / (B + 1)
-        noise = max(float(rest / seen.sum()), _LEAST_NOISE**2)
-        prior = ShapePrior(prior.mean + offset.view(3, P).T, (new + new.T) / 2, noise)
-    C, flat = _without_noise(prior.covariance)
-    return ShapePrior(prior.mean, C, prior.noise + flat)
+    start = _covariance(S) + _FREEDOM * torch.eye(3, dtype=X.dtype).kron(centred)
+    whole = Gaussian(S.mean(0), start, _FIRST_NOISE**2)
+    whole, M = _maximise(whole, X, visible, M, _ITERATIONS, 1)
+    whole = _without_noise(whole)
+    n = min(KINDS, B // _FRAMES_PER_KIND)
+    if n < 2:
+        return (whole,)
+    S, M, _ = _fit(whole, X, visible, M, 1)
+    kind = torch.as_tensor(kmeans2(S.flatten(1).numpy(), n, minit="++", seed=0)[1])
+    for _ in range(_SORTINGS):
+        kinds = []
+        for k in range(n):
+            i = (kind == k).nonzero()[:, 0]
+            if len(i) < _FRAMES_PER_KIND / 4:
+                continue
+            start = Gaussian(S[i].mean(0), _covariance(S[i]) + whole.covariance / 10, whole.noise)
+            gaussian, M[i] = _maximise(start, X[i], visible[i], M[i], _ITERATIONS_OF_A_KIND, 20)
+            kinds.append(gaussian)
+        kind, S, M = _sort(kinds, X, visible, M, 0)
+    return (whole, *map(_without_noise, kinds))
 
 
 def apply(prior, X, visible, M):
@@ -90,34 +90,102 @@ def apply(prior, X, visible, M):
 
     Parameters
     ----------
-    prior : ShapePrior
+    prior : what `learn` returns
     X, visible, M : as in `learn`; M is the camera to start from
     """
-    S, M = torch.empty(*X.shape[:2], 3, dtype=torch.float64), M.double().clone()
-    for part in torch.arange(len(X)).split(_CHUNK):
-        x, seen, m = X[part].double(), visible[part].double().repeat(1, 2), M[part]
-        for _ in range(_TURNS):
-            m = _turn(prior, _look(prior, x, seen, m), seen, m)
-        S[part], M[part] = _look(prior, x, seen, m).shapes, m
+    X = X.double()
+    S, M, _ = _fit(prior[0], X, visible, M.double(), _TURNS)
+    if len(prior) > 1:
+        _, S, M = _sort(prior[1:], X, visible, M, _TURNS_IN_A_KIND)
     return S, M
 
 
 def surprise(prior, X, visible, M):
     """−log p(image) per visible coordinate, mean over frames: how well a prior foresees images.
 
-    Parameters as in `apply`; the cameras are taken as they are.
+    Parameters as in `apply`. Every frame is taken for the kind that foresees it best.
     """
-    total = 0.0
+    X, M = X.double(), M.double()
+    each = torch.stack([_surprise(g, X, visible, M) for g in prior[min(1, len(prior) - 1) :]])
+    return float((each.amin(0) / (2 * visible.sum(1))).mean())
+
+
+def _covariance(S):
+    return torch.cov((S - S.mean(0)).mT.flatten(1).T, correction=0)
+
+
+def _maximise(start, X, visible, M, iterations, weight):
+    """Expectation maximisation from a Gaussian, which counts as much as `weight` frames: (Gaussian, cameras)."""
+    seen = visible.double().repeat(1, 2)  # (B, 2P)
+    M = M.clone()
+    B, P, _ = X.shape
+    gaussian = start
+    for _ in range(iterations):
+        C, noise = gaussian.covariance, gaussian.noise
+        offset, outer, known, rest = 0.0, 0.0, 0.0, 0.0
+        for part in torch.arange(B).split(_CHUNK):
+            post = _look(gaussian, X[part], seen[part], M[part])
+            d = (post.shapes - gaussian.mean).mT.flatten(1)  # (b, 3P)
+            offset = offset + d.sum(0)
+            outer = outer + d.T @ d
+            known = known + post.pairs.flatten(0, 1).T @ _split(post.precision).flatten(0, 1)  # Σ Aᵀ Σ⁻¹ A
+            # σ²: what an image misses by, and what is unsure about that
+            rest = rest + noise**2 * (post.weighted.square().sum() - _trace(post.precision)) + noise * seen[part].sum()
+            M[part] = _turn(gaussian, post, seen[part], M[part])
+        # What the images leave open counts too: each shape's covariance given its image is C − C Aᵀ Σ⁻¹ A C.
+        offset = offset / B
+        new = C + (outer - C @ _join(known, 3) @ C) / B - torch.outer(offset, offset)
+        new = (B * new + weight * start.covariance) / (B + weight)  # few frames do not make C singular
+        noise = max(float(rest / seen.sum()), _LEAST_NOISE**2)
+        gaussian = Gaussian(gaussian.mean + offset.view(3, P).T, (new + new.T) / 2, noise)
+    return gaussian, M
+
+
+def _without_noise(gaussian):
+    """The Gaussian less what its covariance holds in all directions alike, which goes to σ².
+
+    The same variance in all directions cannot be told from noise of the images, and is taken for it. It is
+    read off the smallest tenth of the eigenvalues, twice, since the smallest are estimated too small.
+    """
+    values, vectors = torch.linalg.eigh(gaussian.covariance)
+    flat = 2 * values[3:].quantile(0.1).clamp(min=0)  # the first three belong to the centroid
+    C = (vectors * (values - flat).clamp(min=0)) @ vectors.T
+    return Gaussian(gaussian.mean, C, gaussian.noise + float(flat))
+
+
+def _fit(gaussian, X, visible, M, turns):
+    """Shapes, cameras and surprise after some turns of the cameras."""
+    S, M, surprised = torch.empty(*X.shape[:2], 3, dtype=X.dtype), M.clone(), torch.empty(len(X), dtype=X.dtype)
     for part in torch.arange(len(X)).split(_CHUNK):
-        seen = visible[part].double().repeat(1, 2)
-        post = _look(prior, X[part].double(), seen, M[part].double())
-        total += float((post.surprise / seen.sum(1)).sum())
-    return total / len(X)
+        x, seen, m = X[part], visible[part].double().repeat(1, 2), M[part]
+        for _ in range(turns):
+            m = _turn(gaussian, _look(gaussian, x, seen, m), seen, m)
+        post = _look(gaussian, x, seen, m)
+        S[part], M[part], surprised[part] = post.shapes, m, post.surprise
+    return S, M, surprised
+
+
+def _sort(kinds, X, visible, M, turns):
+    """Every frame in the kind that its image surprises least: that kind, and shapes and cameras in it."""
+    kind = torch.stack([_surprise(g, X, visible, M) for g in kinds]).argmin(0)
+    S, M = torch.empty(*X.shape[:2], 3, dtype=X.dtype), M.clone()
+    for k, gaussian in enumerate(kinds):
+        i = (kind == k).nonzero()[:, 0]
+        if len(i):
+            S[i], M[i], _ = _fit(gaussian, X[i], visible[i], M[i], turns)
+    return kind, S, M
+
+
+def _surprise(gaussian, X, visible, M):
+    """−log p(image) of each frame (B,), the cameras as they are."""
+    seen = visible.double().repeat(1, 2)
+    parts = torch.arange(len(X)).split(_CHUNK)
+    return torch.cat([_foresee(gaussian, X[p], seen[p], M[p])[-1] for p in parts])
 
 
 @dataclass(frozen=True)
 class _Posterior:
-    """What some images say about their shapes, given the prior and the cameras."""
+    """What some images say about their shapes, given a Gaussian and the cameras."""
 
     shapes: torch.Tensor  # (B, P, 3) posterior means
     pairs: torch.Tensor  # (B, 4, 9): products of two entries of a camera, one for each block of C
@@ -126,33 +194,45 @@ class _Posterior:
     surprise: torch.Tensor  # (B,): −log p(image)
 
 
-def _look(prior, X, seen, M):
-    """The posterior of some frames. `seen` (B, 2P) is one where visible, else zero."""
+def _foresee(gaussian, X, seen, M):
+    """What a Gaussian expects of some images: w − A mean, camera pairs, Cholesky factor of Σ = A C Aᵀ + σ², −log p.
+
+    `seen` (B, 2P) is one where visible, else zero.
+    """
     B, P, _ = X.shape
-    y = (X - prior.mean @ M).mT.reshape(B, 2 * P) * seen
-    both = seen[:, :, None] * seen[:, None]
+    y = (X - gaussian.mean @ M).mT.reshape(B, 2 * P) * seen
     pairs = (M.mT[:, :, None, :, None] * M.mT[:, None, :, None, :]).reshape(B, 4, 9)
-    Sigma = _join(pairs @ _split(prior.covariance), 2)
+    Sigma = _join(pairs @ _split(gaussian.covariance), 2)
     if not seen.all():
-        Sigma = (Sigma + _SHIFT**2 * torch.eye(2, dtype=X.dtype).kron(torch.ones(P, P, dtype=X.dtype))) * both
-    Sigma.diagonal(dim1=1, dim2=2).add_(prior.noise)
+        shift = _SHIFT**2 * torch.eye(2, dtype=X.dtype).kron(torch.ones(P, P, dtype=X.dtype))
+        Sigma = (Sigma + shift) * (seen[:, :, None] * seen[:, None])
+    Sigma.diagonal(dim1=1, dim2=2).add_(gaussian.noise)
     root = torch.linalg.cholesky(Sigma)
-    precision = torch.cholesky_inverse(root) * both
+    half = torch.linalg.solve_triangular(root, y[..., None], upper=False)
+    logs = root.diagonal(dim1=1, dim2=2).log().sum(1) + seen.sum(1) * math.log(2 * math.pi) / 2
+    hidden = (1 - seen).sum(1) * math.log(gaussian.noise) / 2  # what σ² alone, in their place, put into `logs`
+    return y, pairs, root, half.square().sum((1, 2)) / 2 + logs - hidden
+
+
+def _look(gaussian, X, seen, M):
+    """The posterior of some frames; `seen` as in `_foresee`."""
+    B, P, _ = X.shape
+    y, pairs, root, surprised = _foresee(gaussian, X, seen, M)
+    precision = torch.cholesky_inverse(root)
+    if not seen.all():
+        precision = precision * (seen[:, :, None] * seen[:, None])
     weighted = (precision @ y[..., None])[..., 0]
-    S = (M @ weighted.view(B, 2, P)).view(B, 3 * P) @ prior.covariance
-    logs = 2 * root.diagonal(dim1=1, dim2=2).log() + math.log(2 * math.pi)
-    hidden = (1 - seen).sum(1) * math.log(2 * math.pi * prior.noise)
-    surprise = ((y * weighted).sum(1) + logs.sum(1) - hidden) / 2
-    return _Posterior(prior.mean + S.view(B, 3, P).mT, pairs, precision, weighted, surprise)
+    S = (M @ weighted.view(B, 2, P)).view(B, 3 * P) @ gaussian.covariance
+    return _Posterior(gaussian.mean + S.view(B, 3, P).mT, pairs, precision, weighted, surprised)
 
 
-def _turn(prior, post, seen, M):
+def _turn(gaussian, post, seen, M):
     """The cameras after one Newton step on −log p(image), by a small rotation of each."""
     B, P, _ = post.shapes.shape
     a = post.weighted
     Q = _split(post.precision - a[:, :, None] * a[:, None])  # (B, 4, P²)
-    T = (Q @ _split(prior.covariance).T).view(B, 2, 2, 3, 3)
-    g = torch.einsum("bmj,bijlm->bli", M, T) - prior.mean.T @ a.view(B, 2, P).mT  # by the entries of M
+    T = (Q @ _split(gaussian.covariance).T).view(B, 2, 2, 3, 3)
+    g = torch.einsum("bmj,bijlm->bli", M, T) - gaussian.mean.T @ a.view(B, 2, P).mT  # by the entries of M
     gradient = torch.linalg.cross(M.mT, g.mT).sum(1)  # by a rotation about each axis
     axes = torch.eye(3, dtype=M.dtype).view(1, 3, 1, 3)
     moves = torch.linalg.cross(axes, M.mT[:, None])  # (B, 3 axes, 2, 3): what each rotation does to the camera
@@ -167,17 +247,6 @@ def _turn(prior, post, seen, M):
     x, y, z = turn.unbind(1)
     o = torch.zeros_like(x)
     return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o], 1).view(B, 3, 3)) @ M
-
-
-def _without_noise(C):
-    """C less what it holds in all directions alike, and that variance.
-
-    The same variance in all directions cannot be told from noise of the images, and is taken for it. It is
-    read off the smallest tenth of the eigenvalues, twice, since the smallest are estimated too small.
-    """
-    values, vectors = torch.linalg.eigh(C)
-    flat = 2 * values[3:].quantile(0.1).clamp(min=0)  # the first three belong to the centroid
-    return (vectors * (values - flat).clamp(min=0)) @ vectors.T, float(flat)
 
 
 def _trace(A):

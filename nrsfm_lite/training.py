@@ -19,7 +19,7 @@ from .model import Config, DeepNRSfM
 MIN_FRAMES = 10
 MIN_POINTS = 4
 _CHECKPOINT_EVERY = 500  # steps
-_PRIOR_FRAMES = 2000  # more add little
+_PRIOR_FRAMES = 4000  # more add little
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,7 @@ def fit(
     progress=True,
     checkpoint=None,
     threads=1,
+    callback=None,
 ):
     """Train a network and its shape prior on 2D landmarks. No 3D is seen, not even that of Landmarks with 3D.
 
@@ -80,8 +81,8 @@ def fit(
         Default: all visible.
     config : Config, optional
         Default: ``Config(n_points=P)``.
-    schedule : "default" or "original"
-        The package's schedule, or the authors' (200,000 steps of Adam on 32 frames).
+    schedule : "default", "original" or a `Schedule`
+        The package's schedule, the authors' (200,000 steps of Adam on 32 frames), or one of your own.
     steps : int, optional
         Another number of steps; the default schedule stretches its learning rates to it.
     seed : int
@@ -96,6 +97,8 @@ def fit(
     threads : int or None
         CPU threads while training, set back afterwards. One is fastest for batches of this size
         unless the machine is idle, and makes results repeatable; None leaves PyTorch's setting.
+    callback : function, optional
+        Called after every step as ``callback(step, net)``, step from 1; to look, not to change anything.
 
     Returns
     -------
@@ -112,9 +115,9 @@ def fit(
     FloatingPointError
         If 100 steps in a row have no finite gradient.
     """
-    if schedule not in SCHEDULES:
-        raise ValueError(f"schedule={schedule!r}; expected one of {', '.join(SCHEDULES)}.")
-    plan = SCHEDULES[schedule]
+    if not isinstance(schedule, Schedule) and schedule not in SCHEDULES:
+        raise ValueError(f"schedule={schedule!r}; expected one of {', '.join(SCHEDULES)}, or a Schedule.")
+    plan = schedule if isinstance(schedule, Schedule) else SCHEDULES[schedule]
     steps = plan.steps if steps is None else int(steps)
     if steps < 1:
         raise ValueError(f"steps={steps}; expected at least 1.")
@@ -178,6 +181,8 @@ def fit(
                 rate.step()
             if checkpoint and ((step + 1) % _CHECKPOINT_EVERY == 0 or step + 1 == steps):
                 _save(checkpoint, key, step + 1, net, optimizers, rates, random)
+            if callback:
+                callback(step + 1, net)
         for p in net.parameters():
             p.data = p.data.clone()  # no longer a piece of the optimiser's vector
         net.cpu().eval()
@@ -187,7 +192,7 @@ def fit(
 
 @torch.no_grad()
 def learn_prior(net, X, visible, random=None):
-    """The `ShapePrior` of some frames, from a trained network's shapes and cameras of at most 2,000 of them.
+    """The shape prior of some frames, from a trained network's shapes and cameras of at most 4,000 of them.
 
     Parameters
     ----------

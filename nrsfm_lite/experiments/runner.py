@@ -4,11 +4,11 @@ An experiment is a module of this package with
 
     QUESTION               one sentence: what is asked
     cases(quick)           list of dicts: all that decides a row, such as data, setting and seed
-    measure(**case)        dict of what was measured for one case
+    measure(**case)        dict of what was measured for one case, or a list of them for several rows
     conditions(quick)      dict of what all cases share; it goes into the provenance
     report(rows)           a few lines of text for people
 
-and the runner makes NAME.csv, one row per case, and NAME.json, where the rows come from.
+and the runner makes NAME.csv, one row per measurement, and NAME.json, where the rows come from.
 """
 
 import csv
@@ -26,7 +26,7 @@ import torch
 
 from . import material
 
-NAMES = ("speed", "inference", "thresholds", "relaxation", "training")
+NAMES = ("speed", "inference", "thresholds", "relaxation", "training", "coherence", "stress")
 _LIBRARIES = ("torch", "numpy", "scipy")
 
 
@@ -78,15 +78,17 @@ def run(name, quick=False, folder=None, say=print):
     for n, (key, case) in enumerate(todo, 1):
         begun = time.perf_counter()
         measured = experiment.measure(**case)
-        row = {**key, **{k: _text(v) for k, v in measured.items()}, "seconds": _text(time.perf_counter() - begun)}
-        rows.append(row)
+        seconds = {"seconds": _text(time.perf_counter() - begun)}
+        several = measured if isinstance(measured, list) else [measured]
+        rows += [{**key, **{k: _text(v) for k, v in m.items()}, **seconds} for m in several]
         rows.sort(key=lambda r: _place(r, cases))
         _write_table(table, rows)
         passed = time.perf_counter() - start
         this_run |= {"rows": n, "seconds": round(passed)}
         _write_origin(origin, name, experiment, quick, rows, this_run)
         left = passed / n * (len(todo) - n)
-        say(f"{n}/{len(todo)} {', '.join(row.values())} · {_duration(left)} left")
+        last = {**key, **{k: _text(v) for k, v in several[-1].items()}}
+        say(f"{n}/{len(todo)} {', '.join(last.values())} · {_duration(left)} left")
     say(experiment.report(rows))
     return rows
 
