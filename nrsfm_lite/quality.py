@@ -39,6 +39,29 @@ def scores(model, W, visible=None, seed=0):
     }
 
 
+def best(models, W, visible=None):
+    """The one of several networks, such as restarts with other seeds, whose prior the images surprise least.
+
+    The networks must have been trained on the same images, so that they share a unit of length.
+
+    Parameters
+    ----------
+    models : sequence of DeepNRSfM, each with a prior, as `fit` returns them
+    W, visible : as in `scores`
+
+    Raises
+    ------
+    ValueError
+        If there is no model, or one without a prior.
+    """
+    if not models:
+        raise ValueError("models is empty; expected at least one network.")
+    values = [surprise(model, W, visible) for model in models]
+    if not np.isfinite(values).all():
+        raise ValueError(f"model {int(np.argmax(~np.isfinite(values)))} has no prior; `fit` learns one.")
+    return models[int(np.argmin(values))]
+
+
 @torch.no_grad()
 def image_error(model, W, visible=None):
     """Mean over frames of ‖W − S M‖ / ‖W‖ over the visible points: the training loss of one forward pass."""

@@ -150,7 +150,8 @@ def _without_noise(gaussian):
     values, vectors = torch.linalg.eigh(gaussian.covariance)
     flat = 2 * values[3:].quantile(0.1).clamp(min=0)  # the first three belong to the centroid
     C = (vectors * (values - flat).clamp(min=0)) @ vectors.T
-    return Gaussian(gaussian.mean, C, gaussian.noise + float(flat))
+    least = 1e-7 * float(values[-1])  # what rounding to single precision, in which networks keep it, may do to C
+    return Gaussian(gaussian.mean, C, max(gaussian.noise + float(flat), least))
 
 
 def _fit(gaussian, X, visible, M, turns):
@@ -238,10 +239,8 @@ def _turn(gaussian, post, seen, M):
     moves = torch.linalg.cross(axes, M.mT[:, None])  # (B, 3 axes, 2, 3): what each rotation does to the camera
     J = (moves @ post.shapes.mT[:, None]).view(B, 3, 2 * P) * seen[:, None]
     curvature = J @ post.precision @ J.mT  # Fisher information, never negative
-    curvature = curvature + _DAMPING * curvature.diagonal(dim1=1, dim2=2).mean(1)[:, None, None] * torch.eye(
-        3, dtype=M.dtype
-    )
-    curvature.diagonal(dim1=1, dim2=2).add_(1e-9)
+    diagonal = curvature.diagonal(dim1=1, dim2=2)
+    diagonal += _DAMPING * diagonal.mean(1, keepdim=True) + 1e-9
     turn = -torch.linalg.solve(curvature, gradient)
     turn = turn * (_LONGEST_TURN / turn.norm(dim=1, keepdim=True)).clamp(max=1)
     x, y, z = turn.unbind(1)

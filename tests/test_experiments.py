@@ -85,6 +85,14 @@ def test_missing_real_data_is_one_sentence(monkeypatch, tmp_path):
         material.load("martial")
 
 
+def test_a_case_may_give_several_rows(toy, tmp_path):
+    toy.measure = lambda data, seed: [{"square": seed**2 + i} for i in range(3)]
+    runner.run("speed", folder=tmp_path, say=lambda line: None)
+    rows = read(tmp_path / "speed.csv")
+    assert [r["square"] for r in rows[3:6]] == ["1", "2", "3"] and len(rows) == 12
+    assert len(runner.run("speed", folder=tmp_path, say=lambda line: None)) == 12  # nothing is measured again
+
+
 @pytest.mark.parametrize("name", experiments.NAMES)
 def test_the_quick_form_of_every_experiment_runs(name, tmp_path, capsys):
     assert cli.main(["experiment", name, "--quick", "--out", str(tmp_path)]) == 0

@@ -1,5 +1,7 @@
 """Training: it learns, it repeats itself, it resumes, and it never turns NaN."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -172,3 +174,11 @@ def test_the_callers_default_dtype_does_not_matter(views):
     finally:
         torch.set_default_dtype(torch.float)
     assert net.D[0].dtype == expected.D[0].dtype == torch.float
+
+
+def test_a_schedule_of_ones_own_and_a_look_at_every_step(views):
+    plan = dataclasses.replace(training.SCHEDULES["default"], steps=7, batch=16, pull=0.0)
+    steps = []
+    net = nl.fit(views, schedule=plan, progress=False, callback=lambda step, net: steps.append((step, net.coherence)))
+    assert [s for s, _ in steps] == list(range(1, 8)) and steps[0][1] != steps[-1][1]
+    assert net.prior is not None

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,10 +11,12 @@ import numpy as np
 from .. import datasets, metrics, quality
 from ..model import Config
 from ..reconstruction import reconstruct
-from ..training import fit
+from ..training import SCHEDULES, fit
 
 _CMU = ("salsa", "indian", "martial")
 _QUICK_STEPS = 60
+# To compare settings of the network itself: longer than the default schedule, and without its pull.
+_LONG = replace(SCHEDULES["default"], steps=2700, pull=0.0)
 
 
 @lru_cache(maxsize=4)
@@ -84,14 +87,15 @@ def variants(setting, values, seeds, quick):
 
 def variant_conditions(setting, quick):
     """What the cases of `variants` share."""
-    return {"network": f"the default, but for {setting}", "steps": _QUICK_STEPS if quick else "the default schedule's"}
+    return {"network": f"the default, but for {setting}", "steps": _QUICK_STEPS if quick else _LONG.steps}
 
 
 def score_variant(data, seed, **setting):
     """`score` of the default network with one setting changed."""
     config = Config(load(data).n_points, **setting)
     train, test = views(data)
-    net = fit(train, config=config, seed=seed, steps=_QUICK_STEPS if data == "motion-small" else None, progress=False)
+    steps = _QUICK_STEPS if data == "motion-small" else None
+    net = fit(train, config=config, schedule=_LONG, steps=steps, seed=seed, progress=False)
     return score(net, train, test)
 
 
