@@ -29,6 +29,7 @@ _ITERATIONS, _ITERATIONS_OF_A_KIND, _SORTINGS = 15, 6, 2
 _TURNS, _TURNS_IN_A_KIND = 4, 3  # Newton steps of a frame's camera
 _FIRST_NOISE, _LEAST_NOISE = 1e-2, 1e-3  # σ
 _FREEDOM = 1e-2  # variance that C grants every coordinate at the start, beside that of the network's shapes
+_LARGEST = 10.0  # root mean square distance of a shape's points: a network that has diverged may say anything
 _SHIFT = 1.0  # standard deviation of t, which stays zero unless points are hidden
 _LONGEST_TURN = 0.3  # radians per Newton step
 _DAMPING = 3e-3  # of a Newton step, as a share of the mean curvature
@@ -61,7 +62,8 @@ def learn(X, visible, S, M):
     """
     X, S, M = X.double(), S.double(), M.double()
     B, P, _ = X.shape
-    S = S - S.mean(1, keepdim=True)
+    S = torch.nan_to_num(S - S.mean(1, keepdim=True))
+    S = S / (S.flatten(1).norm(dim=1) / (_LARGEST * P**0.5)).clamp(min=1)[:, None, None]
     centred = torch.eye(P, dtype=X.dtype) - 1 / P  # C gives the centroid no variance: that is t's part
     start = _covariance(S) + _FREEDOM * torch.eye(3, dtype=X.dtype).kron(centred)
     whole = Gaussian(S.mean(0), start, _FIRST_NOISE**2)
