@@ -120,3 +120,12 @@ def test_few_frames_give_a_finite_answer(truth, frames):
     S, M = shape_prior.apply(prior, images, visible, cameras)
     assert torch.isfinite(S).all() and error(S, shapes) < error(shapes.mean(0).expand_as(shapes), shapes)
     torch.testing.assert_close(M.mT @ M, torch.eye(2, dtype=torch.double).expand(frames, 2, 2))
+
+
+def test_a_network_that_has_diverged_does_not_break_it(truth):
+    _, cameras, images = (x[:600] for x in truth)
+    visible = torch.ones(600, P, dtype=torch.bool)
+    wild = 1e9 * torch.randn(600, P, 3, dtype=torch.double, generator=torch.Generator().manual_seed(0))
+    wild[:5] = torch.nan
+    S, M = shape_prior.apply(shape_prior.learn(images, visible, wild, cameras), images, visible, cameras)
+    assert torch.isfinite(S).all() and torch.isfinite(M).all()
