@@ -23,6 +23,12 @@ def random_cameras(n, seed=0):
     return random_rotations(n, seed)[:, :, :2]
 
 
+def image_turns(angle):
+    """(n, 2, 2) rotations of the image plane, for points as rows, by angles (n,) in radians (a tensor)."""
+    c, s = angle.cos(), angle.sin()
+    return torch.stack([c, -s, s, c], 1).view(-1, 2, 2)
+
+
 def project(S, M, t=None):
     """Image points of shapes: W = S M + t.
 

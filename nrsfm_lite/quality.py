@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from . import shape_prior
-from .cameras import random_cameras
+from .cameras import image_turns, random_cameras
 from .data import as_points
 
 
@@ -90,9 +90,8 @@ def turn_consistency(model, W, visible=None, seed=0):
     """Is an image, turned in its plane by a random angle, given the same shape? Mean of ‖S' − S‖ / ‖S‖."""
     X, _ = _normalized(model, W, visible)
     angle = torch.as_tensor(np.random.default_rng(seed).uniform(0, 2 * np.pi, len(X))).to(X)
-    turn = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()], 1).view(-1, 2, 2)
     S, _, _ = _forward(model, X)
-    again, _, _ = _forward(model, X @ turn)
+    again, _, _ = _forward(model, X @ image_turns(angle))
     return _relative(again, S)
 
 
@@ -118,17 +117,19 @@ def surprise(model, W, visible=None):
 
     The unit of length is the network's.
     """
-    if model.prior is None:
+    prior = model.prior
+    if prior is None:
         return float("nan")
     X, visible = _normalized(model, W, visible)
     _, M, _ = _forward(model, X)
-    _, M = shape_prior.apply(model.prior, X, visible, M)
-    return shape_prior.surprise(model.prior, X, visible, M)
+    X, visible = X.cpu(), visible.cpu()  # where the prior works
+    _, M = shape_prior.apply(prior, X, visible, M.cpu())
+    return shape_prior.surprise(prior, X, visible, M)
 
 
 def _normalized(model, W, visible):
     W, visible, _, _ = as_points(W, visible)
-    W, visible = torch.as_tensor(W), torch.as_tensor(visible)
+    W, visible = (torch.as_tensor(a).to(model.scale.device) for a in (W, visible))
     return model.normalize(W, visible)[0].to(model.gamma.dtype), visible
 
 

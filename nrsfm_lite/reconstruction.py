@@ -78,14 +78,17 @@ def reconstruct(
     else:
         preprocessing.check_extent(W, visible)  # `fit` has checked its own frames
     with use_threads(1):  # as in `fit`: never slow on a busy machine, and the same result everywhere
-        prior = model.prior if refine is True else None
-        if refine is True and (adapt or prior is None):
-            prior = learn_prior(model, model.normalize(W, visible)[0], visible, torch.Generator().manual_seed(seed))
+        if refine and refine != "code":
+            refine = None if adapt else model.prior
+            if refine is None:
+                device = model.scale.device
+                X = model.normalize(W.to(device), visible.to(device))[0].cpu()
+                refine = learn_prior(model, X, visible, torch.Generator().manual_seed(seed))
         F, P, _ = W.shape
         S, M, t = np.empty((F, P, 3)), np.empty((F, 3, 2)), np.empty((F, 2))
         for first in range(0, F, _CHUNK):
             part = slice(first, first + _CHUNK)
-            S[part], M[part], t[part] = infer(model, W[part], visible[part], prior or refine)
+            S[part], M[part], t[part] = infer(model, W[part], visible[part], refine)
     return Reconstruction(
         shapes=S,
         cameras=M,

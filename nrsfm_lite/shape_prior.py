@@ -72,9 +72,12 @@ def learn(X, visible, S, M):
     n = min(KINDS, B // _FRAMES_PER_KIND)
     if n < 2:
         return (whole,)
-    S, M, _ = _fit(whole, X, visible, M, 1)
+    S, M = _fit(whole, X, visible, M, 1)
     kind = torch.as_tensor(kmeans2(S.flatten(1).numpy(), n, minit="++", seed=0)[1])
+    kinds = []
     for _ in range(_SORTINGS):
+        if kinds:
+            kind, S, M = _sort(kinds, X, visible, M, 0)
         kinds = []
         for k in range(n):
             i = (kind == k).nonzero()[:, 0]
@@ -83,7 +86,6 @@ def learn(X, visible, S, M):
             start = Gaussian(S[i].mean(0), _covariance(S[i]) + whole.covariance / 10, whole.noise)
             gaussian, M[i] = _maximise(start, X[i], visible[i], M[i], _ITERATIONS_OF_A_KIND, 20)
             kinds.append(gaussian)
-        kind, S, M = _sort(kinds, X, visible, M, 0)
     return (whole, *map(_without_noise, kinds))
 
 
@@ -96,7 +98,7 @@ def apply(prior, X, visible, M):
     X, visible, M : as in `learn`; M is the camera to start from
     """
     X = X.double()
-    S, M, _ = _fit(prior[0], X, visible, M.double(), _TURNS)
+    S, M = _fit(prior[0], X, visible, M.double(), _TURNS)
     if len(prior) > 1:
         _, S, M = _sort(prior[1:], X, visible, M, _TURNS_IN_A_KIND)
     return S, M
@@ -157,15 +159,14 @@ def _without_noise(gaussian):
 
 
 def _fit(gaussian, X, visible, M, turns):
-    """Shapes, cameras and surprise after some turns of the cameras."""
-    S, M, surprised = torch.empty(*X.shape[:2], 3, dtype=X.dtype), M.clone(), torch.empty(len(X), dtype=X.dtype)
+    """Shapes and cameras after some turns of the cameras."""
+    S, M = torch.empty(*X.shape[:2], 3, dtype=X.dtype), M.clone()
     for part in torch.arange(len(X)).split(_CHUNK):
         x, seen, m = X[part], visible[part].double().repeat(1, 2), M[part]
         for _ in range(turns):
             m = _turn(gaussian, _look(gaussian, x, seen, m), seen, m)
-        post = _look(gaussian, x, seen, m)
-        S[part], M[part], surprised[part] = post.shapes, m, post.surprise
-    return S, M, surprised
+        S[part], M[part] = _look(gaussian, x, seen, m).shapes, m
+    return S, M
 
 
 def _sort(kinds, X, visible, M, turns):
@@ -175,15 +176,21 @@ def _sort(kinds, X, visible, M, turns):
     for k, gaussian in enumerate(kinds):
         i = (kind == k).nonzero()[:, 0]
         if len(i):
-            S[i], M[i], _ = _fit(gaussian, X[i], visible[i], M[i], turns)
+            S[i], M[i] = _fit(gaussian, X[i], visible[i], M[i], turns)
     return kind, S, M
 
 
 def _surprise(gaussian, X, visible, M):
     """−log p(image) of each frame (B,), the cameras as they are."""
-    seen = visible.double().repeat(1, 2)
-    parts = torch.arange(len(X)).split(_CHUNK)
-    return torch.cat([_foresee(gaussian, X[p], seen[p], M[p])[-1] for p in parts])
+    result = torch.empty(len(X), dtype=X.dtype)
+    for part in torch.arange(len(X)).split(_CHUNK):
+        seen = visible[part].double().repeat(1, 2)
+        y, _, root = _foresee(gaussian, X[part], seen, M[part])
+        half = torch.linalg.solve_triangular(root, y[..., None], upper=False)
+        logs = root.diagonal(dim1=1, dim2=2).log().sum(1) + seen.sum(1) * math.log(2 * math.pi) / 2
+        hidden = (1 - seen).sum(1) * math.log(gaussian.noise) / 2  # what σ² alone, in their place, put into `logs`
+        result[part] = half.square().sum((1, 2)) / 2 + logs - hidden
+    return result
 
 
 @dataclass(frozen=True)
@@ -194,11 +201,10 @@ class _Posterior:
     pairs: torch.Tensor  # (B, 4, 9): products of two entries of a camera, one for each block of C
     precision: torch.Tensor  # (B, 2P, 2P): Σ⁻¹, zero where hidden
     weighted: torch.Tensor  # (B, 2P): Σ⁻¹ (w − A mean)
-    surprise: torch.Tensor  # (B,): −log p(image)
 
 
 def _foresee(gaussian, X, seen, M):
-    """What a Gaussian expects of some images: w − A mean, camera pairs, Cholesky factor of Σ = A C Aᵀ + σ², −log p.
+    """What a Gaussian expects of some images: w − A mean, pairs of camera entries, Cholesky factor of Σ = A C Aᵀ + σ².
 
     `seen` (B, 2P) is one where visible, else zero.
     """
@@ -210,23 +216,19 @@ def _foresee(gaussian, X, seen, M):
         shift = _SHIFT**2 * torch.eye(2, dtype=X.dtype).kron(torch.ones(P, P, dtype=X.dtype))
         Sigma = (Sigma + shift) * (seen[:, :, None] * seen[:, None])
     Sigma.diagonal(dim1=1, dim2=2).add_(gaussian.noise)
-    root = torch.linalg.cholesky(Sigma)
-    half = torch.linalg.solve_triangular(root, y[..., None], upper=False)
-    logs = root.diagonal(dim1=1, dim2=2).log().sum(1) + seen.sum(1) * math.log(2 * math.pi) / 2
-    hidden = (1 - seen).sum(1) * math.log(gaussian.noise) / 2  # what σ² alone, in their place, put into `logs`
-    return y, pairs, root, half.square().sum((1, 2)) / 2 + logs - hidden
+    return y, pairs, torch.linalg.cholesky(Sigma)
 
 
 def _look(gaussian, X, seen, M):
     """The posterior of some frames; `seen` as in `_foresee`."""
     B, P, _ = X.shape
-    y, pairs, root, surprised = _foresee(gaussian, X, seen, M)
+    y, pairs, root = _foresee(gaussian, X, seen, M)
     precision = torch.cholesky_inverse(root)
     if not seen.all():
         precision = precision * (seen[:, :, None] * seen[:, None])
     weighted = (precision @ y[..., None])[..., 0]
     S = (M @ weighted.view(B, 2, P)).view(B, 3 * P) @ gaussian.covariance
-    return _Posterior(gaussian.mean + S.view(B, 3, P).mT, pairs, precision, weighted, surprised)
+    return _Posterior(gaussian.mean + S.view(B, 3, P).mT, pairs, precision, weighted)
 
 
 def _turn(gaussian, post, seen, M):

@@ -12,6 +12,7 @@ import torch
 from tqdm import tqdm
 
 from . import preprocessing, shape_prior
+from .cameras import image_turns
 from .data import as_points
 from .gradient import backpropagate
 from .model import Config, DeepNRSfM
@@ -160,7 +161,7 @@ def fit(
             pick = torch.randint(F, (min(plan.batch, F),), generator=random).to(device)
             batch = X[pick]
             if step < plan.turn * steps:
-                batch = batch @ _turns(len(pick), random).to(batch)
+                batch = batch @ image_turns(2 * math.pi * torch.rand(len(pick), generator=random)).to(batch)
             pull = plan.pull * max(0.0, 1 - 2 * step / steps)
             loss = backpropagate(net, batch, None if complete else visible[pick], size[pick], pull)
             norm = torch.nn.utils.clip_grad_norm_(net.parameters(), plan.clip)
@@ -207,13 +208,6 @@ def learn_prior(net, X, visible, random=None):
     X, visible = X[pick], visible[pick]
     psi, M = net.bottleneck(net.encode(X.to(net.scale)))
     return shape_prior.learn(X, visible, net.decode(psi).cpu(), M.cpu())
-
-
-def _turns(n, random):
-    """(n, 2, 2) rotations of the image plane by uniform angles."""
-    angle = 2 * math.pi * torch.rand(n, generator=random)
-    c, s = angle.cos(), angle.sin()
-    return torch.stack([c, -s, s, c], 1).view(n, 2, 2)
 
 
 class FlatAdam(torch.optim.Adam):

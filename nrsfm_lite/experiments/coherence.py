@@ -1,13 +1,11 @@
 """Which number, taken without ground truth, tells a good network from a bad one (chapter 10)?"""
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.stats import spearmanr
 
 from .. import metrics, quality
 from ..reconstruction import reconstruct
-from ..training import SCHEDULES, fit
+from ..training import fit
 from . import material
 
 QUESTION = "Does the coherence of the last dictionary, or any other score without ground truth, rank networks?"
@@ -31,7 +29,7 @@ def conditions(quick):
     return {
         "network": "the default",
         "settings": "the default schedule, its learning rates halved or doubled, and without the pull to the mean",
-        "steps": "60" if quick else "the default schedule's",
+        "steps": material.QUICK_STEPS if quick else "the default schedule's",
         "looks": f"{_LOOKS} in each training, on {_FRAMES} frames drawn once; surprise and refined at the end only",
         "errors": "normalised 3D error; seen, unseen: one forward pass; refined: as `reconstruct` does",
     }
@@ -41,8 +39,8 @@ def measure(data, setting, seed):
     """A row for each look at the network while it trains, and one for the end."""
     train, test = material.views(data)
     some, others = _draw(train), _draw(test)
-    plan = _schedule(**_SETTINGS[setting])
-    steps = 60 if data == "motion-small" else plan.steps
+    plan = material.default_schedule(**_SETTINGS[setting])
+    steps = material.quick_steps(data) or plan.steps
     looks = {round(steps * (i + 1) / _LOOKS) for i in range(_LOOKS - 1)}
     rows = []
 
@@ -90,11 +88,6 @@ def report(rows):
 
 def _words(rhos):
     return ", ".join(f"{data} {rho:+.2f}" for data, rho in rhos.items())
-
-
-def _schedule(rates=1.0, **changes):
-    plan = SCHEDULES["default"]
-    return replace(plan, rate=rates * plan.rate, muon_rate=rates * plan.muon_rate, **changes)
 
 
 def _draw(views):

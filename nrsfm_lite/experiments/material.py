@@ -14,7 +14,7 @@ from ..reconstruction import reconstruct
 from ..training import SCHEDULES, fit
 
 _CMU = ("salsa", "indian", "martial")
-_QUICK_STEPS = 60
+QUICK_STEPS = 60
 # To compare settings of the network itself: longer than the default schedule, and without its pull.
 _LONG = replace(SCHEDULES["default"], steps=2700, pull=0.0)
 
@@ -45,7 +45,7 @@ def describe(name):
     return {"frames": len(data), "points": data.n_points, "sha256": digest[:16]}
 
 
-def score(net, train, test, by_code=True):
+def score(net, train, test):
     """Scores and errors of a trained network. The truth is used here, and nowhere else.
 
     Returns
@@ -64,14 +64,24 @@ def score(net, train, test, by_code=True):
 
     result["seen"], _ = error(train, refine=False)
     result["unseen"], _ = error(test, refine=False)
-    if by_code:
-        result["by_code"], _ = error(train, refine="code")
-        result["by_code_unseen"], _ = error(test, refine="code")
+    result["by_code"], _ = error(train, refine="code")
+    result["by_code_unseen"], _ = error(test, refine="code")
     result["refined"], rec = error(train)
     result["refined_unseen"], _ = error(test)
     result["adapted_unseen"], _ = error(test, adapt=True)
     result["other_hand"] = metrics.handedness(rec.shapes, train.points3d)
     return result
+
+
+def quick_steps(data):
+    """How many steps to train on the small data of quick runs; None, the schedule's own, on any other."""
+    return QUICK_STEPS if data == "motion-small" else None
+
+
+def default_schedule(rates=1.0, **changes):
+    """The default schedule with its learning rates times a factor, and other fields changed by name."""
+    plan = SCHEDULES["default"]
+    return replace(plan, rate=rates * plan.rate, muon_rate=rates * plan.muon_rate, **changes)
 
 
 def views(data):
@@ -87,15 +97,14 @@ def variants(setting, values, seeds, quick):
 
 def variant_conditions(setting, quick):
     """What the cases of `variants` share."""
-    return {"network": f"the default, but for {setting}", "steps": _QUICK_STEPS if quick else _LONG.steps}
+    return {"network": f"the default, but for {setting}", "steps": QUICK_STEPS if quick else _LONG.steps}
 
 
 def score_variant(data, seed, **setting):
     """`score` of the default network with one setting changed."""
     config = Config(load(data).n_points, **setting)
     train, test = views(data)
-    steps = _QUICK_STEPS if data == "motion-small" else None
-    net = fit(train, config=config, schedule=_LONG, steps=steps, seed=seed, progress=False)
+    net = fit(train, config=config, schedule=_LONG, steps=quick_steps(data), seed=seed, progress=False)
     return score(net, train, test)
 
 
@@ -105,9 +114,16 @@ def compare_variants(setting, rows):
     groups = dict.fromkeys((r["data"], r[setting]) for r in rows)
     for data, value in groups:
         chosen = [r for r in rows if (r["data"], r[setting]) == (data, value)]
-        parts = []
-        for key in ("image_error", "by_code", "by_code_unseen"):
-            numbers = np.array([float(r[key]) for r in chosen])
-            parts.append(f"{key} {numbers.mean():.4f} ± {numbers.std(ddof=1) if len(numbers) > 1 else 0:.4f}")
-        lines.append(f"{data}, {setting} {value}, {len(chosen)} seeds: " + ", ".join(parts))
+        words = mean_and_spread(chosen, ("image_error", "by_code", "by_code_unseen"))
+        lines.append(f"{data}, {setting} {value}, {len(chosen)} seeds: {words}")
     return "\n".join(lines)
+
+
+def mean_and_spread(rows, keys):
+    """Mean ± standard deviation of some columns, as text; empty cells are left out."""
+    parts = []
+    for key in keys:
+        numbers = np.array([float(r[key]) for r in rows if r[key]])
+        spread = numbers.std(ddof=1) if len(numbers) > 1 else 0
+        parts.append(f"{key} {numbers.mean():.4g} ± {spread:.2g}" if len(numbers) else f"{key} not measured")
+    return ", ".join(parts)

@@ -80,15 +80,15 @@ def run(name, quick=False, folder=None, say=print):
         measured = experiment.measure(**case)
         seconds = {"seconds": _text(time.perf_counter() - begun)}
         several = measured if isinstance(measured, list) else [measured]
-        rows += [{**key, **{k: _text(v) for k, v in m.items()}, **seconds} for m in several]
+        added = [{**key, **{k: _text(v) for k, v in m.items()}, **seconds} for m in several]
+        rows += added
         rows.sort(key=lambda r: _place(r, cases))
         _write_table(table, rows)
         passed = time.perf_counter() - start
         this_run |= {"rows": n, "seconds": round(passed)}
         _write_origin(origin, name, experiment, quick, rows, this_run)
         left = passed / n * (len(todo) - n)
-        last = {**key, **{k: _text(v) for k, v in several[-1].items()}}
-        say(f"{n}/{len(todo)} {', '.join(last.values())} · {_duration(left)} left")
+        say(f"{n}/{len(todo)} {', '.join(added[-1].values())} · {_duration(left)} left")
     say(experiment.report(rows))
     return rows
 

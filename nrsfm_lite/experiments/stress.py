@@ -1,7 +1,6 @@
 """Does training survive what no one should ask of it?"""
 
 from collections import Counter
-from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +8,8 @@ from .. import datasets, metrics
 from ..data import Landmarks
 from ..model import Config
 from ..reconstruction import reconstruct
-from ..training import SCHEDULES, fit
+from ..training import fit
+from . import material
 
 QUESTION = "Does any learning rate, batch, depth or degenerate data lead to a number that is not one?"
 
@@ -35,8 +35,7 @@ def measure(kind, rates, batch, depth):
     """Whether everything is finite, or the sentence that says why not; and the error, for the curious."""
     data = _data(kind)
     views = datasets.make_views(data, seed=0)
-    plan = SCHEDULES["default"]
-    plan = replace(plan, steps=60, batch=batch, rate=rates * plan.rate, muon_rate=rates * plan.muon_rate)
+    plan = material.default_schedule(rates, steps=material.QUICK_STEPS, batch=batch)
     try:
         net = fit(views, config=Config(31, depth), schedule=plan, progress=False)
         rec = reconstruct(views, model=net)

@@ -2,8 +2,6 @@
 
 import time
 
-import numpy as np
-
 from ..reconstruction import reconstruct
 from ..training import fit
 from . import material
@@ -31,7 +29,7 @@ def conditions(quick):
     """What all cases share."""
     return {
         "network": "the default",
-        "steps": "60" if quick else "the schedule's",
+        "steps": material.QUICK_STEPS if quick else "the schedule's",
         "threads": 1,
         "frames": "training: the first 80 % of the sequences; unseen: the rest",
         "time": "train_seconds: fit; refine_seconds: reconstruct of the training frames with the trained network",
@@ -42,7 +40,7 @@ def measure(schedule, data, seed):
     """One training, its scores and errors, and the time of both halves of `reconstruct`."""
     train, test = material.views(data)
     start = time.perf_counter()
-    net = fit(train, schedule=schedule, seed=seed, steps=60 if data == "motion-small" else None, progress=False)
+    net = fit(train, schedule=schedule, seed=seed, steps=material.quick_steps(data), progress=False)
     train_seconds = time.perf_counter() - start
     start = time.perf_counter()
     reconstruct(train, model=net)
@@ -55,10 +53,6 @@ def report(rows):
     lines = []
     for schedule, data in dict.fromkeys((r["schedule"], r["data"]) for r in rows):
         chosen = [r for r in rows if (r["schedule"], r["data"]) == (schedule, data)]
-        parts = []
-        for key in ("train_seconds", "seen", "refined", "unseen", "refined_unseen"):
-            numbers = np.array([float(r[key]) for r in chosen if r[key]])
-            spread = numbers.std(ddof=1) if len(numbers) > 1 else 0
-            parts.append(f"{key} {numbers.mean():.4g} ± {spread:.2g}" if len(numbers) else f"{key} not measured")
-        lines.append(f"{schedule:8s} {data:7s} {len(chosen)} seeds: {', '.join(parts)}")
+        words = material.mean_and_spread(chosen, ("train_seconds", "seen", "refined", "unseen", "refined_unseen"))
+        lines.append(f"{schedule:8s} {data:7s} {len(chosen)} seeds: {words}")
     return "\n".join(lines)
