@@ -20,7 +20,7 @@ from .model import Config, DeepNRSfM
 MIN_FRAMES = 10
 MIN_POINTS = 4
 _CHECKPOINT_EVERY = 500  # steps
-_PRIOR_FRAMES = 4000  # more add little
+PRIOR_FRAMES = 4000  # more add little
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ def fit(
     visible = visible.to(device)
     complete = bool(visible.all())
     optimizers = make_optimizers(net, plan)
-    decay = _warmup_cosine(steps) if plan.optimizer == "muon" else _exponential
+    decay = warmup_cosine(steps) if plan.optimizer == "muon" else _exponential
     rates = [torch.optim.lr_scheduler.LambdaLR(o, decay) for o in optimizers]
     key = _fingerprint(config, plan, steps, seed, X, visible) if checkpoint else None
     first = _resume(checkpoint, key, net, optimizers, rates, random)
@@ -204,7 +204,7 @@ def learn_prior(net, X, visible, random=None):
     random : torch.Generator, optional
         Draws the frames.
     """
-    pick = torch.randperm(len(X), generator=random)[:_PRIOR_FRAMES]
+    pick = torch.randperm(len(X), generator=random)[:PRIOR_FRAMES]
     X, visible = X[pick], visible[pick]
     psi, M = net.bottleneck(net.encode(X.to(net.scale)))
     return shape_prior.learn(X, visible, net.decode(psi).cpu(), M.cpu())
@@ -235,7 +235,7 @@ def make_optimizers(net, plan):
     return [torch.optim.Muon(inner, plan.muon_rate, weight_decay=plan.muon_decay), adam] if inner else [adam]
 
 
-def _warmup_cosine(steps):
+def warmup_cosine(steps):
     """Rises over the first 5 % of the steps, then half a cosine down to a thousandth."""
     warm = max(1, steps // 20)
 

@@ -26,7 +26,7 @@ import torch
 
 from . import material
 
-NAMES = ("speed", "inference", "thresholds", "relaxation", "training", "coherence", "stress")
+NAMES = ("speed", "inference", "thresholds", "relaxation", "training", "coherence", "stress", "unseen")
 _LIBRARIES = ("torch", "numpy", "scipy")
 
 

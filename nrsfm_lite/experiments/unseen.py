@@ -1,0 +1,181 @@
+"""What helps frames that no network has seen: changes of the default training, each alone (chapter 10)."""
+
+import math
+
+import numpy as np
+import torch
+
+from .. import metrics, shape_prior
+from ..cameras import image_turns, nearest_orthonormal, random_cameras
+from ..model import Config, DeepNRSfM
+from ..preprocessing import set_scale
+from ..training import PRIOR_FRAMES, SCHEDULES, make_optimizers, use_threads, warmup_cosine
+from . import material
+
+QUESTION = "Which changes of the training, or of the network, help on unseen frames? Would 3D supervision?"
+_DEPTH = "3D supervision"
+_ENSEMBLE = "ensemble of 3"
+_ITERATIONS = {"unit dictionaries": 1, "2 iterations": 2, "3 iterations": 3}
+_CHANGES = ("none", _DEPTH, "mirrored images", "hidden points", "noise", "new views", *_ITERATIONS, _ENSEMBLE)
+_NOISE = 0.05  # of a frame's norm
+_HIDDEN = 0.2  # of the points, at most
+
+
+def cases(quick):
+    """Data, change and seed: all changes where settings may be chosen, the comparison with 3D also elsewhere."""
+    if quick:
+        return [{"data": "motion-small", "change": c, "seed": 0} for c in _CHANGES]
+    chosen = [(d, c) for d in ("motion", "salsa") for c in _CHANGES] + [("martial", "none"), ("martial", _DEPTH)]
+    return [{"data": d, "change": c, "seed": s} for s in range(3) for d, c in chosen]
+
+
+def conditions(quick):
+    """What all cases share."""
+    return {
+        "network": "the default",
+        "steps": material.QUICK_STEPS if quick else SCHEDULES["default"].steps,
+        "schedule": "the default; with 3D supervision without its pull",
+        "errors": "mean normalised 3D error; seen, unseen: one pass; refined: with a shape prior learned as in `fit`",
+        _DEPTH: "the loss takes the depth of every point, beside its image, from the truth; shown for comparison only",
+        "new views": "half of each batch: the network's own shapes from new cameras, asked for the same shapes",
+        "unit dictionaries": "spectral norm 1 in the encoder; two or three iterations of block ISTA also have it",
+    }
+
+
+def measure(data, change, seed):
+    """Errors of one network, or of an ensemble, trained with one change."""
+    train, test = material.views(data)
+    seeds = (3 * seed, 3 * seed + 1, 3 * seed + 2) if change == _ENSEMBLE else (seed,)
+    steps = material.quick_steps(data) or SCHEDULES["default"].steps
+    with use_threads(1):
+        nets = [_train(train, change, steps, s) for s in seeds]
+        return _errors(nets, change, train, test)
+
+
+def report(rows):
+    """Mean and spread over seeds, a line per data set and change."""
+    lines = []
+    for data, change in dict.fromkeys((r["data"], r["change"]) for r in rows):
+        chosen = [r for r in rows if (r["data"], r["change"]) == (data, change)]
+        words = material.mean_and_spread(chosen, ("seen", "unseen", "refined", "refined_unseen"))
+        lines.append(f"{data}, {change}, {len(chosen)} seeds: {words}")
+    return "\n".join(lines)
+
+
+def _train(views, change, steps, seed):
+    """The loop of `fit`, with one change and a gradient by autograd."""
+    plan = SCHEDULES["default"]
+    random = torch.Generator().manual_seed(seed)
+    net = DeepNRSfM(Config(views.n_points), generator=random)
+    W = torch.as_tensor(views.points2d)
+    visible = torch.ones(W.shape[:2], dtype=torch.bool)
+    net.scale.fill_(set_scale(W - W.mean(1, keepdim=True), visible))
+    X = net.normalize(W, visible)[0].float()
+    depth = torch.as_tensor(_depths(views)).float() / net.scale
+    optimizers = make_optimizers(net, plan)
+    rates = [torch.optim.lr_scheduler.LambdaLR(o, warmup_cosine(steps)) for o in optimizers]
+    for step in range(steps):
+        pick = torch.randint(len(X), (min(plan.batch, len(X)),), generator=random)
+        images = X[pick]
+        if step < plan.turn * steps:
+            images = images @ image_turns(2 * math.pi * torch.rand(len(pick), generator=random))
+        pull = 0 if change == _DEPTH else plan.pull * max(0.0, 1 - 2 * step / steps)
+        loss = _loss(net, images, depth[pick], change, pull, random)
+        net.zero_grad()
+        loss.backward()
+        if torch.isfinite(torch.nn.utils.clip_grad_norm_(net.parameters(), plan.clip)):
+            for optimizer in optimizers:
+                optimizer.step()
+        for rate in rates:
+            rate.step()
+    return net.eval()
+
+
+def _loss(net, images, depth, change, pull, random):
+    """The loss of `gradient.backpropagate`, changed."""
+    if change == "mirrored images":
+        flip = torch.where(torch.rand(len(images), generator=random) < 0.5, 1.0, -1.0)
+        images = torch.stack([images[..., 0] * flip[:, None], images[..., 1]], -1)
+    shown = images
+    size = images.flatten(1).norm(dim=1)
+    if change == "hidden points":  # the network does not see them; the loss does
+        share = _HIDDEN * torch.rand(len(images), 1, generator=random)
+        shown = images * (torch.rand(images.shape[:2], generator=random) >= share)[..., None]
+    if change == "noise":
+        noise = torch.randn(images.shape, generator=random)
+        shown = images + noise * (_NOISE * size / noise.flatten(1).norm(dim=1))[:, None, None]
+    psi, M = _encode(net, shown, change)
+    S = net.decode(psi)
+    missed = images - S @ M
+    if change == _DEPTH:
+        third = torch.linalg.cross(M[..., 0], M[..., 1])
+        missed = torch.cat([missed, depth[..., None] - S @ third[..., None]], 2)
+    loss = (missed.flatten(1).norm(dim=1) / size).mean()
+    if change == "new views":
+        turned = torch.as_tensor(random_cameras(len(S), int(torch.randint(2**31, (), generator=random)))).float()
+        target = S.detach()
+        psi, _ = _encode(net, target @ turned, change)
+        again = (net.decode(psi) - target).flatten(1).norm(dim=1) / target.flatten(1).norm(dim=1)
+        loss = loss + again.mean() / 2
+    if pull:
+        loss = loss + pull * ((S - net.output_bias).flatten(1).norm(dim=1) / size).mean()
+    return loss
+
+
+def _encode(net, X, change):
+    """Code and camera; with unit dictionaries and further iterations of block ISTA per layer, if asked for."""
+    if change not in _ITERATIONS:
+        return net.bottleneck(net.encode(X))
+    B, P, _ = X.shape
+    first, *rest = net.D
+    Z = X.mT.reshape(2 * B, P)
+    for D, b in zip([first.permute(1, 2, 0).reshape(P, -1), *rest], net.encoder_threshold, strict=True):
+        D = D / torch.linalg.matrix_norm(D, 2)
+        code = torch.relu((Z @ D).view(-1, len(b)) - b)
+        for _ in range(_ITERATIONS[change] - 1):
+            missed = Z - code.view(len(Z), -1) @ D.mT
+            code = torch.relu(code + (missed @ D).view(-1, len(b)) - b)
+        Z = code
+    return net.bottleneck(Z.view(B, 2, 3, -1))
+
+
+@torch.no_grad()
+def _errors(nets, change, train, test):
+    X, S, M = _guess(nets, change, train)
+    visible = torch.ones(X.shape[:2], dtype=torch.bool)
+    pick = torch.randperm(len(X), generator=torch.Generator().manual_seed(0))[:PRIOR_FRAMES]
+    prior = shape_prior.learn(X[pick], visible[pick], S[pick], M[pick])
+    result = {"seen": _error(S, train), "refined": _error(shape_prior.apply(prior, X, visible, M)[0], train)}
+    X, S, M = _guess(nets, change, test)
+    visible = torch.ones(X.shape[:2], dtype=torch.bool)
+    result["unseen"] = _error(S, test)
+    result["refined_unseen"] = _error(shape_prior.apply(prior, X, visible, M)[0], test)
+    return result
+
+
+def _guess(nets, change, views):
+    """Normalised points, shapes and cameras; those of an ensemble turned onto the first network's and averaged."""
+    W = torch.as_tensor(views.points2d)
+    X, _ = nets[0].normalize(W, torch.ones(W.shape[:2], dtype=torch.bool))
+    X = X.float()
+    S_sum, M_sum = 0.0, 0.0
+    for net in nets:
+        psi, M = _encode(net, X, change)
+        S = net.decode(psi)
+        S = S - S.mean(1, keepdim=True)
+        if net is nets[0]:
+            M_first = M
+        U, _, Vh = torch.linalg.svd(torch.einsum("fij,fkj->ik", M_first, M))
+        S_sum, M_sum = S_sum + S @ (U @ Vh).T, M_sum + U @ Vh @ M
+    return X, S_sum / len(nets), nearest_orthonormal(M_sum / len(nets))
+
+
+def _error(S, views):
+    return float(metrics.normalized_error(S, views.points3d).mean())
+
+
+def _depths(views):
+    """(F, P): how far each true point is behind the image."""
+    third = np.cross(views.cameras[:, :, 0], views.cameras[:, :, 1])
+    S = views.points3d - views.points3d.mean(1, keepdims=True)
+    return np.einsum("fpi,fi->fp", S, third)
