@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import check_grad
 
 import nrsfm_lite as nl
-from nrsfm_lite.baselines import tomasi_kanade
+from nrsfm_lite.baselines import complete, tomasi_kanade
 
 
 @pytest.fixture
@@ -32,8 +32,8 @@ def test_takes_an_array_with_any_translation(rigid):
 
 
 def test_what_it_cannot_do_is_said(rigid, rng):
-    with pytest.raises(ValueError, match="1 are hidden"):
-        tomasi_kanade(rigid.points2d, np.arange(270).reshape(30, 9) > 0)
+    with pytest.raises(ValueError, match="point 4 is hidden in every frame"):
+        tomasi_kanade(rigid, np.arange(270).reshape(30, 9) % 9 != 4)
     with pytest.raises(ValueError, match="at least 3 frames"):
         tomasi_kanade(rigid.points2d[:2])
     with pytest.raises(ValueError, match=r"expected \(F, P, 2\)"):
@@ -41,6 +41,19 @@ def test_what_it_cannot_do_is_said(rigid, rng):
     flat = nl.Landmarks(points3d=np.repeat(rng.normal(size=(1, 9, 3)) * (1, 1, 0), 30, axis=0))
     with pytest.raises(ValueError, match="rank below 3"):
         tomasi_kanade(nl.datasets.make_views(flat))
+
+
+def test_few_missing_points_of_low_rank_are_completed(rigid, rng):
+    visible = rng.random((30, 9)) > 0.15
+    visible[:, :3] = True
+    W = np.where(visible[..., None], rigid.points2d + 50.0, np.nan)
+    filled = complete(W, visible)
+    np.testing.assert_array_equal(filled[visible], W[visible])
+    assert np.abs(filled - 50 - rigid.points2d).max() < 0.05 * np.abs(rigid.points2d).max()
+    np.testing.assert_array_equal(complete(rigid), rigid.points2d)
+    rec = tomasi_kanade(W, visible)
+    assert nl.metrics.normalized_error(rec.shapes, rigid.points3d).mean() < 0.02
+    np.testing.assert_array_equal(rec.visible, visible)
 
 
 def smooth_motion(rng, rank=2, frames=120, points=40):
@@ -96,5 +109,5 @@ def test_pta_refuses(rng):
     data = smooth_motion(rng, frames=30)
     with pytest.raises(ValueError, match="rank=30"):
         nl.baselines.pta(data, rank=30)
-    with pytest.raises(ValueError, match="1 are hidden"):
-        nl.baselines.pta(data.points2d, np.arange(1200).reshape(30, 40) > 0)
+    with pytest.raises(ValueError, match="point 0 is hidden in every frame"):
+        nl.baselines.pta(data.points2d, np.arange(1200).reshape(30, 40) % 40 > 0)

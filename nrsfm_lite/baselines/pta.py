@@ -5,6 +5,7 @@ from scipy.fft import idct
 from scipy.optimize import minimize
 
 from ..data import Reconstruction, as_points
+from .completion import complete
 
 
 def pta(W, visible=None, rank=12):
@@ -21,7 +22,7 @@ def pta(W, visible=None, rank=12):
     ----------
     W : Landmarks, or (F, P, 2) array of image points, in temporal order
     visible : (F, P) bool, optional
-        Must be all True.
+        Hidden points are filled in by `complete` first.
     rank : int
         Number of cosines; 3·rank is at most 2F. Akhter et al. choose it per sequence, 5 to 13.
 
@@ -32,14 +33,14 @@ def pta(W, visible=None, rank=12):
     Raises
     ------
     ValueError
-        With hidden points, a rank out of range, or fewer than 6 independent measurements (points or frames).
+        For a rank out of range, fewer than 6 independent measurements (points or frames), or a point hidden
+        in every frame.
     """
     W, visible, names, edges = as_points(W, visible)
-    if not visible.all():
-        raise ValueError(f"pta needs every point visible; {(~visible).sum()} are hidden. Complete W first.")
     F, P, _ = W.shape
     if rank < 1 or 3 * rank > 2 * F:
         raise ValueError(f"rank={rank}; expected 1 … {2 * F // 3} for {F} frames.")
+    W = complete(W, visible)
     t = W.mean(1)
     X = W - t[:, None]
     M = trajectory_cameras(X)  # (F, 3, 2)
@@ -49,8 +50,9 @@ def pta(W, visible=None, rank=12):
     B = np.linalg.lstsq(system, X.transpose(0, 2, 1).reshape(2 * F, P), rcond=None)[0].reshape(rank, 3, P)
     S = np.einsum("fk,kip->fpi", cosines, B)
     return Reconstruction(
-        shapes=S - S.mean(1, keepdims=True), cameras=M, translations=t, names=names, edges=edges, method="pta"
-    )
+        shapes=S - S.mean(1, keepdims=True), cameras=M, translations=t, visible=visible, names=names, edges=edges,
+        method="pta",
+    )  # fmt: skip
 
 
 def trajectory_cameras(X):

@@ -5,6 +5,7 @@ import torch
 
 from ..cameras import nearest_orthonormal
 from ..data import Reconstruction, as_points
+from .completion import complete
 
 
 def tomasi_kanade(W, visible=None):
@@ -19,7 +20,7 @@ def tomasi_kanade(W, visible=None):
     ----------
     W : Landmarks, or (F, P, 2) array of image points
     visible : (F, P) bool, optional
-        Must be all True: factorisation has no place for missing points.
+        Factorisation has no place for missing points: they are filled in by `complete` first.
 
     Returns
     -------
@@ -28,15 +29,14 @@ def tomasi_kanade(W, visible=None):
     Raises
     ------
     ValueError
-        With hidden points, fewer than 3 frames or 4 points, or if all points lie in one plane or the
-        views are all alike (rank below 3).
+        With fewer than 3 frames or 4 points, a point hidden in every frame, or if all points lie in one
+        plane or the views are all alike (rank below 3).
     """
     W, visible, names, edges = as_points(W, visible)
     F, P, _ = W.shape
-    if not visible.all():
-        raise ValueError(f"tomasi_kanade needs every point visible; {(~visible).sum()} are hidden.")
     if F < 3 or P < 4:
         raise ValueError(f"tomasi_kanade needs at least 3 frames and 4 points; got {F} and {P}.")
+    W = complete(W, visible)
     t = W.mean(1)
     X = (W - t[:, None]).transpose(0, 2, 1).reshape(2 * F, P)  # rows: x and y of each frame
     U, s, Vh = np.linalg.svd(X, full_matrices=False)
@@ -48,7 +48,7 @@ def tomasi_kanade(W, visible=None):
     S = (np.linalg.solve(G, np.sqrt(s[:3])[:, None] * Vh[:3])).T  # (P, 3)
     return Reconstruction(
         shapes=np.broadcast_to(S - S.mean(0), (F, P, 3)).copy(),
-        cameras=M, translations=t, names=names, edges=edges, method="tomasi_kanade",
+        cameras=M, translations=t, visible=visible, names=names, edges=edges, method="tomasi_kanade",
     )  # fmt: skip
 
 
