@@ -44,18 +44,30 @@ def align(S, S_true, *, scale=True, reflections=True):
     return S @ (U @ Vh), S_true
 
 
-def normalized_error(S, S_true, *, scale=True, reflections=True):
+def normalized_error(S, S_true, *, scale=True, reflections=True, points=None):
     """Normalised 3D error per frame, ‖S − S*‖_F / ‖S*‖_F after `align` (paper, experiments).
 
     Parameters as in `align`. ``scale=True`` is the evaluation of the paper's authors;
     ``scale=False`` is the common per-frame error of the classical literature.
 
+    points : (F, P) bool, optional
+        Count only these points, for instance the hidden ones; the alignment still takes all. Their root mean
+        square distance is divided by the root mean square of the whole true shape, so that the squared
+        error of all points is the mean of the squared errors of two halves, weighted by their sizes.
+
     Returns
     -------
-    (F,) array; the number that papers print is its mean.
+    (F,) array; the number that papers print is its mean. NaN for a frame with none of `points`.
     """
     S, S_true = align(S, S_true, scale=scale, reflections=reflections)
-    return np.linalg.norm(S - S_true, axis=(1, 2)) / np.linalg.norm(S_true, axis=(1, 2))
+    if points is None:
+        return np.linalg.norm(S - S_true, axis=(1, 2)) / np.linalg.norm(S_true, axis=(1, 2))
+    points = np.asarray(points, bool)
+    if points.shape != S.shape[:2]:
+        raise ValueError(f"points has shape {points.shape}; expected {S.shape[:2]}.")
+    count = np.where(points.any(1), points.sum(1), np.nan)
+    square = (((S - S_true) ** 2).sum(2) * points).sum(1) / count
+    return np.sqrt(square / (S_true**2).sum(2).mean(1))
 
 
 def e3d(S, S_true):

@@ -45,6 +45,19 @@ def test_what_each_error_forgives(rng):
     np.testing.assert_allclose(metrics.mpjpe(S + 5, S), 0, atol=1e-12)
 
 
+def test_the_error_of_some_points_and_of_the_others_make_that_of_all(rng):
+    S, S_true = rng.normal(size=(2, 6, 9, 3))
+    hidden = rng.random((6, 9)) < 0.4
+    hidden[0] = False
+    whole = metrics.normalized_error(S, S_true)
+    some, rest = (metrics.normalized_error(S, S_true, points=p) for p in (hidden, ~hidden))
+    assert np.isnan(some[0]) and rest[0] == pytest.approx(whole[0])
+    share = hidden.mean(1)[1:]
+    np.testing.assert_allclose(share * some[1:] ** 2 + (1 - share) * rest[1:] ** 2, whole[1:] ** 2)
+    with pytest.raises(ValueError, match=r"points has shape \(6, 8\)"):
+        metrics.normalized_error(S, S_true, points=hidden[:, :8])
+
+
 def test_mpjpe_by_hand():
     S_true = np.array([[[0.0, 0, 0], [2, 0, 0]]])
     S = np.array([[[0.0, 0, 0], [0, 0, 4]]])
