@@ -7,6 +7,7 @@ import pytest
 
 import nrsfm_lite as nl
 from nrsfm_lite import datasets
+from nrsfm_lite.datasets import views as views_module
 
 
 @pytest.fixture(scope="module")
@@ -127,6 +128,40 @@ def test_missing_by_number_and_by_share(motion):
     assert set((~datasets.make_views(motion, missing=0.3).visible).sum(1)) == {round(0.3 * 31)}
 
 
+def test_a_point_behind_a_rod_is_hidden_and_one_beside_or_before_it_is_not():
+    rod = [(-1, 0, 0), (1, 0, 0)]
+    points = [(0, 0, -0.8), (0, 0, 0.8), (0, 0.5, -0.8), (0.99, 0, -0.01)]  # behind, before, beside, too close
+    S = np.array([rod + points], float)
+    data = nl.Landmarks(points3d=S - S.mean(1, keepdims=True), edges=[(0, 1)])
+    front = np.eye(3)[None, :, :2]  # x right, y up: the viewer is at positive z
+    size = np.ptp(S, axis=1).max()
+    visible = views_module._in_sight(data.points3d, front, data.edges, 0.05 * size)
+    assert visible[0].tolist() == [True, True, False, True, True, True]
+    behind = views_module._in_sight(data.points3d, front * (-1, 1), data.edges, 0.05 * size)
+    assert behind[0].tolist() == [True, True, True, False, True, True]
+
+
+def test_a_body_hides_a_part_of_itself(motion):
+    views = datasets.make_views(motion, missing="self")
+    share = 1 - views.visible.mean(0)
+    assert 0.1 < share.mean() < 0.4 and views.visible.sum(1).min() >= 5
+    trunk, toe = motion.names.index("abdomen"), motion.names.index("left_toe")
+    assert share[trunk] > 2 * share[toe]
+    with pytest.raises(ValueError, match="landmarks with edges"):
+        datasets.make_views(nl.Landmarks(points3d=motion.points3d), missing="self")
+
+
+def test_perspective_is_a_pinhole_and_far_away_orthographic(motion):
+    far, near = (datasets.make_views(motion, projection="perspective", distance=d) for d in (1e6, 2.0))
+    np.testing.assert_allclose(far.points2d, far.points3d @ far.cameras, atol=1e-4)
+    third = np.cross(near.cameras[:, :, 0], near.cameras[:, :, 1])
+    centre = third * 2.0 * np.ptp(near.points3d, axis=1).max()  # (F, 3)
+    ray = near.points3d - centre[:, None]
+    image = near.cameras @ near.points2d.swapaxes(1, 2)  # the image lies in the plane through the centroid
+    to_image = image.swapaxes(1, 2) - centre[:, None]
+    np.testing.assert_allclose(np.cross(ray, to_image), 0, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("more", "message"),
     [
@@ -134,6 +169,7 @@ def test_missing_by_number_and_by_share(motion):
         ({"scale_range": (1, 2)}, "no meaning for orthographic"),
         ({"projection": "weak_perspective", "scale_range": (2, 1)}, "0 < low <= high"),
         ({"noise": -1}, "noise=-1"),
+        ({"projection": "perspective", "distance": 1.0}, "distance=1.0"),
         ({"missing": 31}, "at most 30 of 31"),
         ({"missing": -1}, "at least 0"),
         ({"translation_range": -1}, "translation_range=-1"),

@@ -8,29 +8,45 @@ from ..cameras import project, random_cameras
 from ..data import Landmarks
 
 
-def make_views(data, seed=0, projection="orthographic", missing=0, noise=0.0, scale_range=None, translation_range=None):
+def make_views(
+    data,
+    seed=0,
+    projection="orthographic",
+    missing=0,
+    noise=0.0,
+    scale_range=None,
+    translation_range=None,
+    distance=4.0,
+):
     """One random view of each frame of a motion, whose shapes are first centred over their points.
 
     Parameters
     ----------
     data : Landmarks with points3d
     seed : int
-    projection : "orthographic" or "weak_perspective"
+    projection : "orthographic", "weak_perspective" or "perspective"
         Weak perspective draws a scale per frame from `scale_range` (default 0.5 … 1.5) and moves
         the true shape's size with it: ``points2d = points3d @ cameras + translations`` still holds.
-    missing : int or float
+        Perspective is a pinhole at `distance` from the centroid that looks at it, with the focal length that
+        shows the plane through the centroid at its own size: there the equation holds only nearly.
+    missing : int, float or "self"
         An int m hides 1 … m points of each frame, uniformly (the paper's protocol); a float p hides
-        round(p·P) points. Hidden coordinates are NaN.
+        round(p·P) points; "self" hides what the body itself is in front of, taking every edge for a rod
+        of 5 % of the object's size in radius. Hidden coordinates are NaN.
     noise : float
         ‖noise‖_F / ‖centred W‖_F, Gaussian.
     scale_range : (low, high), optional
+        Weak perspective and perspective; with the latter a scale is drawn only if this is given.
     translation_range : float, optional
         Largest shift of the image per axis, in sizes of the object (the largest extent over all frames).
+    distance : float
+        Of a perspective camera, in sizes of the object; more than 1.
 
     Returns
     -------
     Landmarks with points2d, visible, cameras, translations, and as points3d the centred (for weak
-    perspective also scaled) shapes of `data`, so that ``points3d @ cameras + translations`` is the image.
+    perspective also scaled) shapes of `data`, so that ``points3d @ cameras + translations`` is the image,
+    exactly or, for perspective, nearly.
 
     Raises
     ------
@@ -39,8 +55,13 @@ def make_views(data, seed=0, projection="orthographic", missing=0, noise=0.0, sc
     """
     if not isinstance(data, Landmarks) or data.points3d is None:
         raise ValueError("make_views needs Landmarks with points3d; got none.")
-    if projection not in ("orthographic", "weak_perspective"):
-        raise ValueError(f"projection={projection!r}; expected 'orthographic' or 'weak_perspective'.")
+    if projection not in ("orthographic", "weak_perspective", "perspective"):
+        raise ValueError(f"projection={projection!r}; expected 'orthographic', 'weak_perspective' or 'perspective'.")
+    if not 1 < distance < np.inf:
+        raise ValueError(f"distance={distance}; expected a number above 1, in sizes of the object.")
+    if isinstance(missing, str) and (missing != "self" or not len(data.edges)):
+        expected = "a number or 'self'" if missing != "self" else "landmarks with edges, which are what hides points"
+        raise ValueError(f"missing={missing!r}; expected {expected}.")
     if scale_range is not None and projection == "orthographic":
         raise ValueError("scale_range has no meaning for orthographic views; use projection='weak_perspective'.")
     if not 0 <= noise < np.inf:
@@ -54,25 +75,52 @@ def make_views(data, seed=0, projection="orthographic", missing=0, noise=0.0, sc
     )
     cameras = random_cameras(n_frames, cameras_rng)
     S = data.points3d - data.points3d.mean(1, keepdims=True)
-    if projection == "weak_perspective":
+    if projection == "weak_perspective" or scale_range is not None:
         low, high = (0.5, 1.5) if scale_range is None else scale_range
         if not 0 < low <= high:
             raise ValueError(f"scale_range={scale_range}; expected 0 < low <= high.")
         S = S * scale_rng.uniform(low, high, (n_frames, 1, 1))
     translations = np.zeros((n_frames, 2))
+    size = np.ptp(S, axis=1).max()
     if translation_range:
-        size = np.ptp(S, axis=1).max()
         translations = shift_rng.uniform(-1, 1, (n_frames, 2)) * translation_range * size
     W = project(S, cameras)
+    if projection == "perspective":
+        far = distance * size
+        W = W * (far / (far - _nearness(S, cameras)))[..., None]
     perturbation = noise_rng.standard_normal(W.shape)
     perturbation *= (
         noise * np.linalg.norm(W, axis=(1, 2), keepdims=True) / np.linalg.norm(perturbation, axis=(1, 2), keepdims=True)
     )
-    visible = _hide(hide_rng, missing, n_frames, n_points)
+    if missing == "self":
+        visible = _in_sight(S, cameras, data.edges, 0.05 * size)
+    else:
+        visible = _hide(hide_rng, missing, n_frames, n_points)
     W = np.where(visible[..., None], W + perturbation + translations[:, None], np.nan)
     return replace(
         data, points2d=W, visible=visible, confidence=None, points3d=S, cameras=cameras, translations=translations
     )
+
+
+def _nearness(S, cameras):
+    """(F, P): how far each point is from the centroid's plane towards the viewer. x right, y up, z to the viewer."""
+    return np.einsum("fpi,fi->fp", S, np.cross(cameras[:, :, 0], cameras[:, :, 1]))
+
+
+def _in_sight(S, cameras, edges, radius):
+    """(F, P) bool: False where a rod of this radius around some edge is in front of a point."""
+    Q = np.concatenate([project(S, cameras), _nearness(S, cameras)[..., None]], 2)  # x, y, nearness
+    visible = np.ones(S.shape[:2], bool)
+    for a, b in edges:
+        start, along = Q[:, None, a], (Q[:, b] - Q[:, a])[:, None]  # (F, 1, 3)
+        length = (along[..., :2] ** 2).sum(-1)
+        share = ((Q - start)[..., :2] * along[..., :2]).sum(-1) / np.where(length > 0, length, 1)
+        nearest = start + np.clip(share, 0, 1)[..., None] * along  # (F, P, 3): of the rod's axis, in the image
+        beside = np.linalg.norm((nearest - Q)[..., :2], axis=-1)
+        hidden = (beside < radius) & (nearest[..., 2] - Q[..., 2] > radius)
+        hidden[:, [a, b]] = False  # a joint is part of its own rods
+        visible &= ~hidden
+    return visible
 
 
 def _hide(rng, missing, n_frames, n_points):
