@@ -271,6 +271,44 @@ def as_points(W, visible=None):
     return np.where(visible[..., None], W, 0.0), visible, names, edges
 
 
+def as_weights(W, visible=None, confidence=None):
+    """How much every point of W counts: its confidence where it is visible, zero where it is hidden.
+
+    Parameters
+    ----------
+    W, visible
+        As in `as_points`.
+    confidence : (F, P), optional
+        From 0 to 1; a point of confidence 0 is hidden. Default: that of the Landmarks, else 1.
+
+    Returns
+    -------
+    (F, P) float64 array
+
+    Raises
+    ------
+    ValueError
+        As `as_points`; also for a visible point whose confidence is not from 0 to 1, and for a frame of
+        which no visible point has any.
+    """
+    _, seen, _, _ = as_points(W, visible)
+    if confidence is None and isinstance(W, Landmarks):
+        confidence = W.confidence
+    if confidence is None:
+        return seen.astype(float)
+    confidence = _as_array("confidence", confidence, float)
+    if confidence.shape != seen.shape:
+        raise ValueError(f"confidence has shape {confidence.shape}; expected {seen.shape}.")
+    bad = seen & ~((confidence >= 0) & (confidence <= 1))
+    if bad.any():
+        frame, point = np.argwhere(bad)[0]
+        raise ValueError(f"confidence is {confidence[frame, point]} at frame {frame}, point {point}; expected 0 to 1.")
+    weights = np.where(seen, confidence, 0.0)
+    if not weights.any(1).all():
+        raise ValueError(f"frame {weights.any(1).argmin()} of W has no visible point with confidence; leave it out.")
+    return weights
+
+
 def check_visible_finite(key, points, visible):
     """Raise ValueError if a visible point of `points` (F, P, d) is not finite, naming the first frame."""
     bad = visible & ~np.isfinite(points).all(-1)

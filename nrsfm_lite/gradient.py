@@ -16,15 +16,17 @@ _relu_backward = torch.ops.aten.threshold_backward.grad_input
 def backpropagate(net, X, visible=None, size=None, pull=0.0):
     """The training loss of a batch (paper, eq. 27); its gradient is left in the parameters' ``.grad``.
 
-    ``mean_f ‖Ω (W_f − S_f M_f)‖_F / size_f``, with the network's shape and camera of each frame.
+    ``mean_f ‖Ω (W_f − S_f M_f − 1 t_fᵀ)‖_F / size_f``, with the network's shape and camera of each frame and the
+    translation that fits them best. On complete, centred images of a network without translations t is left
+    out, as it is zero but for the shapes' centroid, which the loss then draws to zero.
 
     Parameters
     ----------
     net : DeepNRSfM
     X : (B, P, 2) tensor
         Normalised points, zero where hidden.
-    visible : (B, P) bool tensor, optional
-        Default: everything.
+    visible : (B, P) tensor, optional
+        Bool, or weights from 0 to 1, of which Ω holds the square roots. Default: everything.
     size : (B,) tensor, optional
         Default: ‖X_f‖_F, as in the authors' code. Ones give the paper's own loss.
     pull : float
@@ -41,16 +43,17 @@ def backpropagate(net, X, visible=None, size=None, pull=0.0):
     c = list(net.decoder_threshold)
     beta, gamma = net.beta, net.gamma
     soft = net.config.threshold == "soft"
+    rows = net.config.block_rows
 
     # Forward, as in `model`. Every code is kept; thresholds work in place.
-    image = X.mT.reshape(2 * B, P)
-    first = D0.permute(1, 2, 0).reshape(P, -1)  # (P, 3 K₁)
-    codes = [_threshold((image @ first).view(6 * B, -1).sub_(b0), b0, soft)]
+    image = net.first_image(X, visible).mT.reshape(2 * B, P)
+    first = net.first_dictionary()  # (P, rows K₁)
+    codes = [_threshold((image @ first).view(2 * rows * B, -1).sub_(b0), b0, soft)]
     for Di, bi in zip(D, b, strict=True):
-        codes.append(_threshold(torch.addmm(bi, codes[-1], Di, beta=-1), bi, soft))  # (6B, K_i)
+        codes.append(_threshold(torch.addmm(bi, codes[-1], Di, beta=-1), bi, soft))  # (2 rows B, K_i)
     Z = codes[-1]
-    M, *rest = polar((Z @ gamma).view(B, 2, 3).mT.contiguous())
-    psi = Z.view(B, -1) @ beta if net.config.beta == "full" else beta @ Z.view(B, 6, -1)
+    M, *rest = polar((Z @ gamma).view(B, 2, rows)[:, :, :3].mT.contiguous())
+    psi = Z.view(B, -1) @ beta if net.config.beta == "full" else beta @ Z.view(B, 2 * rows, -1)
     sign = psi.sign() if soft else None
     decoded = [psi.abs() if soft else psi]
     for Di, ci in zip(D[::-1], c[::-1], strict=True):
@@ -58,12 +61,20 @@ def backpropagate(net, X, visible=None, size=None, pull=0.0):
     S = torch.addmm(net.output_bias.view(-1), decoded[-1], D0.view(len(D0), -1)).view(B, P, 3)
     R = torch.baddbmm(X, S, M, beta=-1)
     if visible is not None:
-        R *= visible[..., None]
+        weight = visible.to(R.dtype)[..., None]
+        t = (R * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
+        root = weight.sqrt()
+        R = R.sub_(t).mul_(root)
+    elif net.config.translation:
+        R -= R.mean(1, keepdim=True)
     missed = R.flatten(1).norm(dim=1)
 
-    # Backward. g is always the gradient of what the forward pass made at this point.
-    minus = X.new_full((6 * B,), -1.0)  # sums up columns, as a product
+    # Backward. g is always the gradient of what the forward pass made at this point. At the best t the
+    # loss does not change with t, so t counts as a constant.
+    minus = X.new_full((2 * rows * B,), -1.0)  # sums up columns, as a product
     g = R.mul_((1 / (B * size * missed.clamp(min=1e-12)))[:, None, None])
+    if visible is not None:
+        g *= root
     gM = S.mT @ g
     g = (g @ M.mT).view(B, -1)
     _set(net.output_bias, g.sum(0).view(P, 3))
@@ -78,13 +89,16 @@ def backpropagate(net, X, visible=None, size=None, pull=0.0):
         dD.append(g.mT @ decoded[-2 - i])
         g = g @ Di
     g = g * sign if soft else g
-    gA = polar_gradient(gM, M, *rest).mT.reshape(-1)
+    gA = polar_gradient(gM, M, *rest).mT
+    if rows == 4:
+        gA = torch.nn.functional.pad(gA, (0, 1))  # no camera in the fourth row
+    gA = gA.reshape(-1)
     if net.config.beta == "full":
         _set(beta, Z.view(B, -1).mT @ g)
-        g = (g @ beta.mT).view(6 * B, -1)
+        g = (g @ beta.mT).view(2 * rows * B, -1)
     else:
-        _set(beta, torch.einsum("bjk,bk->j", Z.view(B, 6, -1), g))
-        g = (beta[:, None] * g[:, None]).reshape(6 * B, -1)
+        _set(beta, torch.einsum("bjk,bk->j", Z.view(B, 2 * rows, -1), g))
+        g = (beta[:, None] * g[:, None]).reshape(2 * rows * B, -1)
     _set(gamma, Z.mT @ gA)
     g.addr_(gA, gamma)
     for i in range(len(D) - 1, -1, -1):
@@ -92,7 +106,7 @@ def backpropagate(net, X, visible=None, size=None, pull=0.0):
         D[i].grad = dD[i].addmm_(codes[i].mT, g)
         g = g @ D[i].mT
     g = _mask(g, codes[0], b0, soft, minus).view(2 * B, -1)
-    dD0 += (image.mT @ g).view(P, 3, -1).permute(2, 0, 1)
+    dD0 += (image.mT @ g).view(P, rows, -1)[:, :3].permute(2, 0, 1)
     D0.grad = dD0
     return (missed / size).mean()
 

@@ -16,6 +16,8 @@ from .cameras import nearest_orthonormal
 from .shape_prior import KINDS, Gaussian
 from .sparse_coding import mutual_coherence
 
+EPSILON = 0.05  # ε of the 4×2 model: the length of the row of translations in D₁
+
 
 @dataclass(frozen=True)
 class Config:
@@ -40,6 +42,9 @@ class Config:
         Add a learned mean shape S̄ (the authors' code) to the last, linear layer.
     projection : "orthographic" or "weak_perspective"
         One scale for the whole set, or one per frame that goes into the shape.
+    translation : bool
+        The 4×2 model: images are not centred, and a fourth row in every block takes the translation
+        (paper, section on scale and translation; chapter 13).
 
     Raises
     ------
@@ -55,6 +60,7 @@ class Config:
     threshold: str = "relu"
     output_bias: bool = True
     projection: str = "orthographic"
+    translation: bool = False
 
     def __post_init__(self):
         for key in ("n_points", "n_dictionaries", "first_atoms", "last_atoms"):
@@ -80,6 +86,11 @@ class Config:
     def widths(self):
         """[K₁, …, K_N]."""
         return np.linspace(self.first_atoms, self.last_atoms, self.n_dictionaries).astype(int).tolist()
+
+    @property
+    def block_rows(self):
+        """3, or 4 with translations: blocks are 3×2 or 4×2."""
+        return 4 if self.translation else 3
 
 
 class DeepNRSfM(nn.Module):
@@ -108,10 +119,12 @@ class DeepNRSfM(nn.Module):
         )
         self.encoder_threshold = nn.ParameterList([nn.Parameter(torch.zeros(k)) for k in K])
         self.decoder_threshold = nn.ParameterList([nn.Parameter(torch.zeros(k)) for k in K[:-1]])
-        self.beta = nn.Parameter(torch.empty(6 * K[-1], K[-1]) if config.beta == "full" else torch.empty(6))
+        entries = 2 * config.block_rows  # of a block
+        self.beta = nn.Parameter(torch.empty(*(entries * K[-1], K[-1]) if config.beta == "full" else (entries,)))
         self.gamma = nn.Parameter(torch.empty(K[-1]))
         self.output_bias = nn.Parameter(torch.zeros(P, 3), requires_grad=config.output_bias)
         self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("origin", torch.zeros(2))
         n = 1 + KINDS
         self.register_buffer("prior_mean", torch.zeros(n, P, 3))
         self.register_buffer("prior_covariance", torch.zeros(n, 3 * P, 3 * P))
@@ -128,7 +141,8 @@ class DeepNRSfM(nn.Module):
         for D in list(self.D)[1:]:
             glorot(D, *D.shape)
         last = self.config.last_atoms
-        glorot(self.beta, 6 * last if self.config.beta == "full" else 6, last)
+        entries = 2 * self.config.block_rows
+        glorot(self.beta, entries * last if self.config.beta == "full" else entries, last)
         glorot(self.gamma, last, 1)
 
     @property
@@ -150,19 +164,36 @@ class DeepNRSfM(nn.Module):
             self.prior_mean[i], self.prior_covariance[i] = gaussian.mean, gaussian.covariance
             self.prior_noise[i] = gaussian.noise
 
-    def encode(self, X):
-        """Block sparse code of normalised points: (B, P, 2) -> Psi_N (B, 2, 3, K_N).
+    def encode(self, X, visible=None):
+        """Block sparse code of normalised points: (B, P, 2) -> Psi_N (B, 2, 3, K_N), with translations (B, 2, 4, K_N).
 
         One step of block ISTA per layer. The columns of a block come before its rows here, so that
-        every layer is one matrix product over the flattened batch (chapter 06).
+        every layer is one matrix product over the flattened batch (chapter 06). `visible` (B, P) is
+        bool or holds weights from 0 to 1; `X` is zero where it is.
         """
         B, P, _ = X.shape
-        D1 = self.D[0].permute(1, 2, 0).reshape(P, -1)  # (P, 3 K₁)
-        Z = X.mT.reshape(2 * B, P) @ D1  # (2B, 3 K₁)
-        Z = self._threshold(Z.view(6 * B, -1), self.encoder_threshold[0])  # (6B, K₁)
+        n = 2 * self.config.block_rows * B
+        Z = self.first_image(X, visible).mT.reshape(2 * B, P) @ self.first_dictionary()  # (2B, rows K₁)
+        Z = self._threshold(Z.view(n, -1), self.encoder_threshold[0])  # (n, K₁)
         for D, b in zip(list(self.D)[1:], list(self.encoder_threshold)[1:], strict=True):
-            Z = self._threshold(Z @ D, b)  # (6B, K_i)
-        return Z.view(B, 2, 3, -1)
+            Z = self._threshold(Z @ D, b)  # (n, K_i)
+        return Z.view(B, 2, self.config.block_rows, -1)
+
+    def first_image(self, X, visible=None):
+        """What the first layer takes in: points times weights, times P over the sum of weights (chapter 11)."""
+        if visible is None:
+            return X
+        weight = visible.to(X.dtype)
+        share = weight.mean(1).clamp(min=1e-6)
+        return X * (weight / share[:, None])[..., None]
+
+    def first_dictionary(self):
+        """D₁ as the first layer multiplies with it: (P, 3 K₁), or (P, 4 K₁) with the row of translations."""
+        D1 = self.D[0].permute(1, 2, 0)  # (P, 3, K₁)
+        if self.config.translation:
+            sign = 1.0 - 2 * (torch.arange(D1.shape[2], device=D1.device) % 2)
+            D1 = torch.cat([D1, (EPSILON * sign).to(D1).expand(len(D1), 1, -1)], 1)
+        return D1.reshape(len(D1), -1)
 
     def _threshold(self, x, b):
         """η(x; b), one threshold per atom."""
@@ -170,15 +201,15 @@ class DeepNRSfM(nn.Module):
         return above if self.config.threshold == "relu" else above - torch.relu(-x - b)
 
     def bottleneck(self, Psi):
-        """Sparse code and camera of Psi_N (B, 2, 3, K): psi (B, K) and M (B, 3, 2), orthonormal."""
-        B, _, _, K = Psi.shape
+        """Sparse code and camera of Psi_N (B, 2, rows, K): psi (B, K) and M (B, 3, 2), orthonormal."""
+        B, _, rows, K = Psi.shape
         full = self.config.beta == "full"
-        psi = Psi.reshape(B, 6 * K) @ self.beta if full else self.beta @ Psi.reshape(B, 6, K)
+        psi = Psi.reshape(B, -1) @ self.beta if full else self.beta @ Psi.reshape(B, 2 * rows, K)
         if self.config.threshold == "soft":
             # The picture turned by 180°, −W, shows the same shape. With odd thresholds every block changes
             # its sign, and so does M, as it must; the code must not (chapter 09).
             psi = psi.abs()
-        return psi, nearest_orthonormal((Psi @ self.gamma).mT)
+        return psi, nearest_orthonormal((Psi @ self.gamma)[:, :, :3].mT)
 
     def decode(self, psi):
         """Shape of a sparse code, in normalised units: (B, K_N) -> (B, P, 3)."""
@@ -188,12 +219,14 @@ class DeepNRSfM(nn.Module):
         return S.view(-1, *self.output_bias.shape) + self.output_bias
 
     def normalize(self, W, visible):
-        """Centred, scaled points with zeros where hidden; and each frame's scale (B,)."""
+        """Scaled points, centred but for a model of translations, zero where hidden; and each frame's scale (B,)."""
         X, _ = preprocessing.center(W, visible)
         if self.config.projection == "orthographic":
             scale = self.scale.expand(X.shape[0])  # not len(X), which `torch.export` would fix
         else:
             scale = preprocessing.frame_scale(X, visible)
+        if self.config.translation:
+            X = torch.where((visible > 0)[..., None], W - self.origin, 0.0)
         return X / scale[:, None, None], scale
 
     def forward(self, W, visible=None):
@@ -212,7 +245,7 @@ class DeepNRSfM(nn.Module):
         if visible is None:
             visible = torch.ones(W.shape[:2], dtype=torch.bool, device=W.device)
         X, scale = self.normalize(W, visible)
-        psi, M = self.bottleneck(self.encode(X))
+        psi, M = self.bottleneck(self.encode(X, visible))
         S = self.decode(psi)
         S = (S - S.mean(1, keepdim=True)) * scale[:, None, None]
         t = preprocessing.visible_mean(W - S @ M, visible)  # the best t in closed form
@@ -263,6 +296,7 @@ class DeepNRSfM(nn.Module):
         """The network that `to_arrays` took apart."""
         weights = {k: torch.as_tensor(v) for k, v in weights.items()}
         net = cls(Config(**config), generator=torch.Generator()).to(weights["scale"].dtype)
-        older = {k: v for k, v in net.state_dict().items() if k.startswith("prior_")}  # files once had no prior
+        # Files of earlier versions have no prior and no origin.
+        older = {k: v for k, v in net.state_dict().items() if k.startswith(("prior_", "origin"))}
         net.load_state_dict(older | weights)
         return net.eval()

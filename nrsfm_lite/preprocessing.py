@@ -8,8 +8,9 @@ import torch
 
 
 def visible_mean(W, visible):
-    """Mean of the visible points of each frame: (B, P, 2), (B, P) bool -> (B, 2)."""
-    return torch.where(visible[..., None], W, 0.0).sum(1) / visible.sum(1, keepdim=True).clamp(min=1)
+    """Mean of the visible points of each frame, weighted if `visible` holds weights: (B, P, 2), (B, P) -> (B, 2)."""
+    weight = visible.to(W.dtype)[..., None]
+    return torch.where(weight > 0, W * weight, 0.0).sum(1) / weight.sum(1).clamp(min=1e-12)
 
 
 def center(W, visible):
@@ -18,25 +19,33 @@ def center(W, visible):
     Parameters
     ----------
     W : (B, P, 2) tensor; hidden points may be NaN
-    visible : (B, P) bool tensor
+    visible : (B, P) tensor, bool or weights from 0 to 1
 
     Returns
     -------
     X : (B, P, 2), mean : (B, 2)
     """
     mean = visible_mean(W, visible)
-    return torch.where(visible[..., None], W - mean[:, None], 0.0), mean
+    return torch.where((visible > 0)[..., None], W - mean[:, None], 0.0), mean
 
 
 def frame_scale(X, visible):
     """Root mean square coordinate of each frame's visible points: (B, P, 2), (B, P) -> (B,)."""
-    count = 2 * visible.sum(1).clamp(min=1)
-    return (X.square().sum((1, 2)) / count).sqrt()
+    return (_weighted_squares(X, visible) / (2 * visible.sum(1)).clamp(min=1e-12)).sqrt()
 
 
 def set_scale(X, visible):
     """One scale for a whole set of centred frames: the root mean square over all visible coordinates."""
-    return (X.square().sum() / (2 * visible.sum())).sqrt()
+    return (_weighted_squares(X, visible).sum() / (2 * visible.sum())).sqrt()
+
+
+def frame_size(X, visible):
+    """‖X‖_F of each frame, points weighted as in the loss: (B, P, 2), (B, P) -> (B,)."""
+    return _weighted_squares(X, visible).sqrt()
+
+
+def _weighted_squares(X, visible):
+    return (X.square().sum(2) * visible).sum(1)
 
 
 def check_extent(W, visible):
@@ -46,7 +55,7 @@ def check_extent(W, visible):
     """
     X, _ = center(W, visible)
     extent = X.abs().amax((1, 2))
-    point = extent <= 1e-9 * torch.where(visible[..., None], W, 0.0).abs().amax((1, 2))
+    point = extent <= 1e-9 * torch.where((visible > 0)[..., None], W, 0.0).abs().amax((1, 2))
     if point.all():
         raise ValueError("W has all its visible points at one place in every frame; there is no shape to see.")
     if point.any():

@@ -10,7 +10,8 @@ import torch
 
 from . import shape_prior
 from .cameras import image_turns, random_cameras
-from .data import as_points
+from .data import as_points, as_weights
+from .preprocessing import center, frame_size
 
 
 def scores(model, W, visible=None, seed=0):
@@ -64,11 +65,12 @@ def best(models, W, visible=None):
 
 @torch.no_grad()
 def image_error(model, W, visible=None):
-    """Mean over frames of ‖W − S M‖ / ‖W‖ over the visible points: the training loss of one forward pass."""
-    X, seen = _normalized(model, W, visible)
-    S, M, _ = _forward(model, X)
-    missed = torch.where(seen[..., None], X - S @ M, 0.0).flatten(1).norm(dim=1)
-    return float((missed / X.flatten(1).norm(dim=1)).mean())
+    """Mean over frames of ‖W − S M − 1tᵀ‖ / ‖W‖ over the visible points: the training loss of one forward pass."""
+    X, weight = _normalized(model, W, visible)
+    S, M, _ = _forward(model, X, weight)
+    missed, _ = center(X - S @ M, weight)
+    X, _ = center(X, weight)
+    return float((frame_size(missed, weight) / frame_size(X, weight)).mean())
 
 
 @torch.no_grad()
@@ -79,7 +81,7 @@ def consistency(model, W, visible=None, seed=0):
     over frames of ‖S' − S‖ / ‖S‖, in the network's own coordinates, so that a turned or mirrored answer
     counts as an error.
     """
-    S, _, _ = _forward(model, _normalized(model, W, visible)[0])
+    S, _, _ = _forward(model, *_normalized(model, W, visible))
     cameras = torch.as_tensor(random_cameras(len(S), seed)).to(S)
     again, _, _ = _forward(model, S @ cameras)
     return _relative(again, S)
@@ -88,17 +90,17 @@ def consistency(model, W, visible=None, seed=0):
 @torch.no_grad()
 def turn_consistency(model, W, visible=None, seed=0):
     """Is an image, turned in its plane by a random angle, given the same shape? Mean of ‖S' − S‖ / ‖S‖."""
-    X, _ = _normalized(model, W, visible)
+    X, weight = _normalized(model, W, visible)
     angle = torch.as_tensor(np.random.default_rng(seed).uniform(0, 2 * np.pi, len(X))).to(X)
-    S, _, _ = _forward(model, X)
-    again, _, _ = _forward(model, X @ image_turns(angle))
+    S, _, _ = _forward(model, X, weight)
+    again, _, _ = _forward(model, X @ image_turns(angle), weight)
     return _relative(again, S)
 
 
 @torch.no_grad()
 def distortion(model, W, visible=None):
     """How far the cameras are from orthonormal before the projection makes them so: mean (σ₁ − σ₂) / (σ₁ + σ₂)."""
-    A = (model.encode(_normalized(model, W, visible)[0]) @ model.gamma).mT
+    A = (model.encode(*_normalized(model, W, visible)) @ model.gamma)[:, :, :3].mT
     sigma = torch.linalg.svdvals(A)  # (B, 2)
     return float(((sigma[:, 0] - sigma[:, 1]) / sigma.sum(1).clamp(min=1e-12)).mean())
 
@@ -106,7 +108,7 @@ def distortion(model, W, visible=None):
 @torch.no_grad()
 def code_dimension(model, W, visible=None):
     """In how many directions the codes spread: (Σλ)² / Σλ² of the eigenvalues of their covariance."""
-    _, _, psi = _forward(model, _normalized(model, W, visible)[0])
+    _, _, psi = _forward(model, *_normalized(model, W, visible))
     values = torch.linalg.eigvalsh(torch.cov(psi.double().T)).clamp(min=0)
     return float(values.sum() ** 2 / values.square().sum().clamp(min=1e-300))
 
@@ -120,22 +122,23 @@ def surprise(model, W, visible=None):
     prior = model.prior
     if prior is None:
         return float("nan")
-    X, visible = _normalized(model, W, visible)
-    _, M, _ = _forward(model, X)
-    X, visible = X.cpu(), visible.cpu()  # where the prior works
-    _, M = shape_prior.apply(prior, X, visible, M.cpu())
-    return shape_prior.surprise(prior, X, visible, M)
+    X, weight = _normalized(model, W, visible)
+    _, M, _ = _forward(model, X, weight)
+    X, weight = center(X, weight)[0].cpu(), weight.cpu()  # where the prior works
+    _, M = shape_prior.apply(prior, X, weight, M.cpu())
+    return shape_prior.surprise(prior, X, weight, M)
 
 
 def _normalized(model, W, visible):
-    W, visible, _, _ = as_points(W, visible)
-    W, visible = (torch.as_tensor(a).to(model.scale.device) for a in (W, visible))
-    return model.normalize(W, visible)[0].to(model.gamma.dtype), visible
+    """Points in the network's units and their weights, where the network is."""
+    weight = torch.as_tensor(as_weights(W, visible)).to(model.scale.device)
+    W = torch.as_tensor(as_points(W, visible)[0]).to(model.scale.device)
+    return model.normalize(W, weight)[0].to(model.gamma.dtype), weight.to(model.gamma.dtype)
 
 
-def _forward(model, X):
+def _forward(model, X, weight=None):
     """Centred shapes, cameras and codes in the network's units."""
-    psi, M = model.bottleneck(model.encode(X))
+    psi, M = model.bottleneck(model.encode(X, weight))
     S = model.decode(psi)
     return S - S.mean(1, keepdim=True), M, psi
 

@@ -50,8 +50,8 @@ def learn(X, visible, S, M):
 
     Parameters
     ----------
-    X : (B, P, 2) tensor, centred, zero where hidden
-    visible : (B, P) bool tensor
+    X : (B, P, 2) tensor, centred over the visible points, zero where hidden
+    visible : (B, P) tensor, bool or weights from 0 to 1: a point of weight ω has the noise σ²/ω
     S, M : (B, P, 3) and (B, 3, 2) tensors
         A network's shapes and cameras, to start from.
 
@@ -111,7 +111,12 @@ def surprise(prior, X, visible, M):
     """
     X, M = X.double(), M.double()
     each = torch.stack([_surprise(g, X, visible, M) for g in prior[min(1, len(prior) - 1) :]])
-    return float((each.amin(0) / (2 * visible.sum(1))).mean())
+    return float((each.amin(0) / (2 * (visible > 0).sum(1))).mean())
+
+
+def _root_weight(visible):
+    """√ω of every image coordinate, (B, 2P). Rows of an image times √ω all have the noise σ²; zero strikes them out."""
+    return visible.double().sqrt().repeat(1, 2)
 
 
 def _covariance(S):
@@ -120,7 +125,7 @@ def _covariance(S):
 
 def _maximise(start, X, visible, M, iterations, weight):
     """Expectation maximisation from a Gaussian, which counts as much as `weight` frames: (Gaussian, cameras)."""
-    seen = visible.double().repeat(1, 2)  # (B, 2P)
+    seen = _root_weight(visible)
     M = M.clone()
     B, P, _ = X.shape
     gaussian = start
@@ -133,14 +138,13 @@ def _maximise(start, X, visible, M, iterations, weight):
             offset = offset + d.sum(0)
             outer = outer + d.T @ d
             known = known + post.pairs.flatten(0, 1).T @ _split(post.precision).flatten(0, 1)  # Σ Aᵀ Σ⁻¹ A
-            # σ²: what an image misses by, and what is unsure about that
-            rest = rest + noise**2 * (post.weighted.square().sum() - _trace(post.precision)) + noise * seen[part].sum()
-            M[part] = _turn(gaussian, post, seen[part], M[part])
+            rest = rest + post.noise
+            M[part] = _turn(gaussian, post, M[part])
         # What the images leave open counts too: each shape's covariance given its image is C − C Aᵀ Σ⁻¹ A C.
         offset = offset / B
         new = C + (outer - C @ _join(known, 3) @ C) / B - torch.outer(offset, offset)
         new = (B * new + weight * start.covariance) / (B + weight)  # few frames do not make C singular
-        noise = max(float(rest / seen.sum()), _LEAST_NOISE**2)
+        noise = max(float(rest / (seen > 0).sum()), _LEAST_NOISE**2)
         gaussian = Gaussian(gaussian.mean + offset.view(3, P).T, (new + new.T) / 2, noise)
     return gaussian, M
 
@@ -162,9 +166,9 @@ def _fit(gaussian, X, visible, M, turns):
     """Shapes and cameras after some turns of the cameras."""
     S, M = torch.empty(*X.shape[:2], 3, dtype=X.dtype), M.clone()
     for part in torch.arange(len(X)).split(_CHUNK):
-        x, seen, m = X[part], visible[part].double().repeat(1, 2), M[part]
+        x, seen, m = X[part], _root_weight(visible[part]), M[part]
         for _ in range(turns):
-            m = _turn(gaussian, _look(gaussian, x, seen, m), seen, m)
+            m = _turn(gaussian, _look(gaussian, x, seen, m), m)
         S[part], M[part] = _look(gaussian, x, seen, m).shapes, m
     return S, M
 
@@ -184,12 +188,13 @@ def _surprise(gaussian, X, visible, M):
     """−log p(image) of each frame (B,), the cameras as they are."""
     result = torch.empty(len(X), dtype=X.dtype)
     for part in torch.arange(len(X)).split(_CHUNK):
-        seen = visible[part].double().repeat(1, 2)
+        seen = _root_weight(visible[part])
         y, _, root = _foresee(gaussian, X[part], seen, M[part])
         half = torch.linalg.solve_triangular(root, y[..., None], upper=False)
-        logs = root.diagonal(dim1=1, dim2=2).log().sum(1) + seen.sum(1) * math.log(2 * math.pi) / 2
-        hidden = (1 - seen).sum(1) * math.log(gaussian.noise) / 2  # what σ² alone, in their place, put into `logs`
-        result[part] = half.square().sum((1, 2)) / 2 + logs - hidden
+        hidden = seen == 0
+        logs = root.diagonal(dim1=1, dim2=2).log() - seen.masked_fill(hidden, gaussian.noise**0.5).log()
+        count = (~hidden).double().sum(1)
+        result[part] = half.square().sum((1, 2)) / 2 + logs.sum(1) + count * math.log(2 * math.pi) / 2
     return result
 
 
@@ -199,20 +204,21 @@ class _Posterior:
 
     shapes: torch.Tensor  # (B, P, 3) posterior means
     pairs: torch.Tensor  # (B, 4, 9): products of two entries of a camera, one for each block of C
-    precision: torch.Tensor  # (B, 2P, 2P): Σ⁻¹, zero where hidden
-    weighted: torch.Tensor  # (B, 2P): Σ⁻¹ (w − A mean)
+    precision: torch.Tensor  # (B, 2P, 2P): √Ω Σ⁻¹ √Ω
+    weighted: torch.Tensor  # (B, 2P): √Ω Σ⁻¹ √Ω (w − A mean)
+    noise: torch.Tensor  # expected sum of squares of √Ω times what the images miss by, for σ²
 
 
 def _foresee(gaussian, X, seen, M):
-    """What a Gaussian expects of some images: w − A mean, pairs of camera entries, Cholesky factor of Σ = A C Aᵀ + σ².
+    """What a Gaussian expects of some images, their rows weighted by √Ω, which is `seen` (B, 2P).
 
-    `seen` (B, 2P) is one where visible, else zero.
+    Returns y = √Ω (w − A mean), products of camera entries, and the Cholesky factor of Σ = √Ω A C Aᵀ √Ω + σ².
     """
     B, P, _ = X.shape
     y = (X - gaussian.mean @ M).mT.reshape(B, 2 * P) * seen
     pairs = (M.mT[:, :, None, :, None] * M.mT[:, None, :, None, :]).reshape(B, 4, 9)
     Sigma = _join(pairs @ _split(gaussian.covariance), 2)
-    if not seen.all():
+    if not (seen == 1).all():
         shift = _SHIFT**2 * torch.eye(2, dtype=X.dtype).kron(torch.ones(P, P, dtype=X.dtype))
         Sigma = (Sigma + shift) * (seen[:, :, None] * seen[:, None])
     Sigma.diagonal(dim1=1, dim2=2).add_(gaussian.noise)
@@ -224,14 +230,17 @@ def _look(gaussian, X, seen, M):
     B, P, _ = X.shape
     y, pairs, root = _foresee(gaussian, X, seen, M)
     precision = torch.cholesky_inverse(root)
-    if not seen.all():
-        precision = precision * (seen[:, :, None] * seen[:, None])
     weighted = (precision @ y[..., None])[..., 0]
+    # What an image misses by, and what is unsure about that; rows struck out add nothing.
+    noise = gaussian.noise**2 * (weighted.square().sum() - _trace(precision)) + gaussian.noise * seen.numel()
+    if not (seen == 1).all():
+        precision = precision * (seen[:, :, None] * seen[:, None])
+        weighted = weighted * seen
     S = (M @ weighted.view(B, 2, P)).view(B, 3 * P) @ gaussian.covariance
-    return _Posterior(gaussian.mean + S.view(B, 3, P).mT, pairs, precision, weighted)
+    return _Posterior(gaussian.mean + S.view(B, 3, P).mT, pairs, precision, weighted, noise)
 
 
-def _turn(gaussian, post, seen, M):
+def _turn(gaussian, post, M):
     """The cameras after one Newton step on −log p(image), by a small rotation of each."""
     B, P, _ = post.shapes.shape
     a = post.weighted
@@ -241,7 +250,7 @@ def _turn(gaussian, post, seen, M):
     gradient = torch.linalg.cross(M.mT, g.mT).sum(1)  # by a rotation about each axis
     axes = torch.eye(3, dtype=M.dtype).view(1, 3, 1, 3)
     moves = torch.linalg.cross(axes, M.mT[:, None])  # (B, 3 axes, 2, 3): what each rotation does to the camera
-    J = (moves @ post.shapes.mT[:, None]).view(B, 3, 2 * P) * seen[:, None]
+    J = (moves @ post.shapes.mT[:, None]).view(B, 3, 2 * P)
     curvature = J @ post.precision @ J.mT  # Fisher information, never negative
     diagonal = curvature.diagonal(dim1=1, dim2=2)
     diagonal += _DAMPING * diagonal.mean(1, keepdim=True) + 1e-9

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from . import preprocessing, shape_prior
 from .cameras import image_turns
-from .data import as_points
+from .data import as_points, as_weights
 from .gradient import backpropagate
 from .model import Config, DeepNRSfM
 
@@ -60,6 +60,7 @@ def fit(
     config=None,
     schedule="default",
     *,
+    confidence=None,
     steps=None,
     seed=0,
     device=None,
@@ -70,9 +71,10 @@ def fit(
 ):
     """Train a network and its shape prior on 2D landmarks. No 3D is seen, not even that of Landmarks with 3D.
 
-    The loss is the paper's: the reprojection error ‖W − S M‖_F of each frame over its visible points,
-    divided by ‖W‖_F as in the authors' code. A step whose gradient is not finite is left out. In the end
-    the network's cameras give a Gaussian prior over shapes (`shape_prior`), which `reconstruct` refines with.
+    The loss is the paper's: the reprojection error ‖W − S M‖_F of each frame over its visible points (with
+    hidden ones, after the translation that fits best), divided by ‖W‖_F as in the authors' code. A step
+    whose gradient is not finite is left out. In the end the network's cameras give a Gaussian prior over
+    shapes (`shape_prior`), which `reconstruct` refines with.
 
     Parameters
     ----------
@@ -84,6 +86,9 @@ def fit(
         Default: ``Config(n_points=P)``.
     schedule : "default", "original" or a `Schedule`
         The package's schedule, the authors' (200,000 steps of Adam on 32 frames), or one of your own.
+    confidence : (F, P), optional
+        From 0 to 1, weights of the visible points in the first layer, the loss and the prior. Default: that
+        of the Landmarks, else 1.
     steps : int, optional
         Another number of steps; the default schedule stretches its learning rates to it.
     seed : int
@@ -109,8 +114,8 @@ def fit(
     ------
     ValueError
         For arrays of wrong shape, visible points that are not finite, too few frames or points, a
-        frame with no visible point or all of them at one place, an unknown schedule, or a checkpoint
-        that belongs to other data or settings.
+        frame with no visible point or all of them at one place, a point that no frame shows, an unknown
+        schedule, or a checkpoint that belongs to other data or settings.
     FileNotFoundError
         If the folder of the checkpoint does not exist.
     FloatingPointError
@@ -124,8 +129,9 @@ def fit(
         raise ValueError(f"steps={steps}; expected at least 1.")
     if checkpoint is not None and not Path(checkpoint).parent.is_dir():
         raise FileNotFoundError(f"{Path(checkpoint).parent}: no such folder for the checkpoint.")
-    W, visible, _, _ = as_points(W, visible)
-    W, visible = torch.as_tensor(W), torch.as_tensor(visible)
+    weight = torch.as_tensor(as_weights(W, visible, confidence))
+    W, _, names, _ = as_points(W, visible)
+    W = torch.as_tensor(W)
     F, P, _ = W.shape
     if F < MIN_FRAMES or P < MIN_POINTS:
         raise ValueError(
@@ -137,21 +143,27 @@ def fit(
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
 
-    preprocessing.check_extent(W, visible)
+    unseen = (weight == 0).all(0)
+    if unseen.any():
+        point = int(unseen.nonzero()[0])
+        raise ValueError(f"point {names[point] if names else point} is hidden in every frame of W; leave it out.")
+    preprocessing.check_extent(W, weight)
     seed = int(seed)
     random = torch.Generator().manual_seed(seed)
     net = DeepNRSfM(config, generator=random).float()
-    X, _ = preprocessing.center(W, visible)
-    net.scale.fill_(preprocessing.set_scale(X, visible))
-    X = net.normalize(W, visible)[0].float().to(device)
-    size = X.flatten(1).norm(dim=1)
+    X, mean = preprocessing.center(W, weight)
+    net.scale.fill_(preprocessing.set_scale(X, weight))
+    net.origin.copy_(mean.mean(0))
+    X, _ = net.normalize(W, weight)
+    centred, _ = preprocessing.center(X, weight)
+    size = preprocessing.frame_size(centred, weight).float().to(device)
+    complete = bool((weight == 1).all())
+    X, weight = X.float().to(device), weight.float().to(device)
     net.to(device)
-    visible = visible.to(device)
-    complete = bool(visible.all())
     optimizers = make_optimizers(net, plan)
     decay = warmup_cosine(steps) if plan.optimizer == "muon" else _exponential
     rates = [torch.optim.lr_scheduler.LambdaLR(o, decay) for o in optimizers]
-    key = _fingerprint(config, plan, steps, seed, X, visible) if checkpoint else None
+    key = _fingerprint(config, plan, steps, seed, X, weight) if checkpoint else None
     first = _resume(checkpoint, key, net, optimizers, rates, random)
 
     running, skipped = None, 0
@@ -163,7 +175,7 @@ def fit(
             if step < plan.turn * steps:
                 batch = batch @ image_turns(2 * math.pi * torch.rand(len(pick), generator=random)).to(batch)
             pull = plan.pull * max(0.0, 1 - 2 * step / steps)
-            loss = backpropagate(net, batch, None if complete else visible[pick], size[pick], pull)
+            loss = backpropagate(net, batch, None if complete else weight[pick], size[pick], pull)
             norm = torch.nn.utils.clip_grad_norm_(net.parameters(), plan.clip)
             if torch.isfinite(norm):  # a camera one step from degenerate can ask for an infinite step
                 for optimizer in optimizers:
@@ -187,7 +199,7 @@ def fit(
         for p in net.parameters():
             p.data = p.data.clone()  # no longer a piece of the optimiser's vector
         net.cpu().eval()
-        net.prior = learn_prior(net, X.cpu(), visible.cpu(), random)
+        net.prior = learn_prior(net, X.cpu(), weight.cpu(), random)
     return net
 
 
@@ -200,13 +212,14 @@ def learn_prior(net, X, visible, random=None):
     net : DeepNRSfM
     X : (F, P, 2) tensor
         Normalised points, zero where hidden.
-    visible : (F, P) bool tensor
+    visible : (F, P) tensor, bool or weights from 0 to 1
     random : torch.Generator, optional
         Draws the frames.
     """
     pick = torch.randperm(len(X), generator=random)[:PRIOR_FRAMES]
     X, visible = X[pick], visible[pick]
-    psi, M = net.bottleneck(net.encode(X.to(net.scale)))
+    psi, M = net.bottleneck(net.encode(X.to(net.scale), visible.to(net.scale.device)))
+    X, _ = preprocessing.center(X, visible)
     return shape_prior.learn(X, visible, net.decode(psi).cpu(), M.cpu())
 
 
@@ -251,8 +264,8 @@ def _exponential(step):
     return 0.95 ** (step / 10_000)
 
 
-def _fingerprint(config, plan, steps, seed, X, visible):
-    digest = hashlib.sha256(X.cpu().numpy().tobytes() + visible.cpu().numpy().tobytes())
+def _fingerprint(config, plan, steps, seed, X, weight):
+    digest = hashlib.sha256(X.cpu().numpy().tobytes() + weight.cpu().numpy().tobytes())
     settings = json.dumps([asdict(config), asdict(plan), steps, seed], sort_keys=True)
     digest.update(settings.encode())
     return digest.hexdigest()

@@ -25,8 +25,12 @@ def network(dtype=torch.double, **settings):
 
 
 def by_autograd(net, X, visible, size, pull=0.0):
-    psi, M = net.bottleneck(net.encode(X))
-    residual = (X - net.decode(psi) @ M) * visible[..., None]
+    psi, M = net.bottleneck(net.encode(X, visible))
+    residual = X - net.decode(psi) @ M
+    if visible is not None or net.config.translation:
+        weight = torch.ones(X.shape[:2]).to(X) if visible is None else visible.to(X)
+        t = (residual * weight[..., None]).sum(1) / weight.sum(1, keepdim=True)
+        residual = (residual - t[:, None]) * weight[..., None].sqrt()
     loss = (residual.flatten(1).norm(dim=1) / size).mean()
     away = (net.decode(psi) - net.output_bias).flatten(1).norm(dim=1) / size
     objective = loss + pull * away.mean()
@@ -46,8 +50,8 @@ def test_loss_and_gradient_are_autograds(batch, beta, threshold):
 
 def test_the_papers_own_loss_without_bias_in_float32(batch):
     net = network(torch.float, output_bias=False)
-    X, visible = batch[0].float(), torch.ones(11, 7, dtype=torch.bool)
-    expected, gradients = by_autograd(net, X, visible, torch.ones(11))
+    X = batch[0].float()
+    expected, gradients = by_autograd(net, X, None, torch.ones(11))
     torch.testing.assert_close(backpropagate(net, X, None, torch.ones(11)), expected.detach())
     for p, g in zip([p for p in net.parameters() if p.requires_grad], gradients, strict=True):
         torch.testing.assert_close(p.grad, g, rtol=1e-4, atol=1e-6)
@@ -60,6 +64,20 @@ def test_the_pull_to_the_mean_shape_is_in_the_gradient_only(batch):
     size = X.flatten(1).norm(dim=1)
     expected, gradients = by_autograd(net, X, visible, size, pull=0.7)
     torch.testing.assert_close(backpropagate(net, X, visible, size, 0.7), expected.detach())
+    for p, g in zip(net.parameters(), gradients, strict=True):
+        torch.testing.assert_close(p.grad, g, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("hidden", [True, False])
+@pytest.mark.parametrize("beta", ["full", "shared"])
+def test_translations_and_weights(batch, beta, hidden):
+    net = network(beta=beta, translation=True)
+    X = batch[0] + torch.randn(11, 1, 2, dtype=torch.double, generator=torch.Generator().manual_seed(2))
+    weight = torch.rand(11, 7, dtype=torch.double, generator=torch.Generator().manual_seed(3)) * batch[1]
+    X, weight = (X * (weight > 0)[..., None], weight) if hidden else (X, None)
+    size = X.flatten(1).norm(dim=1)
+    expected, gradients = by_autograd(net, X, weight, size)
+    torch.testing.assert_close(backpropagate(net, X, weight), expected.detach(), rtol=1e-10, atol=0)
     for p, g in zip(net.parameters(), gradients, strict=True):
         torch.testing.assert_close(p.grad, g, rtol=1e-10, atol=1e-12)
 

@@ -8,6 +8,7 @@ import torch
 
 import nrsfm_lite as nl
 from nrsfm_lite.experiments.convolution import ConvolutionNet
+from nrsfm_lite.model import EPSILON
 
 
 @pytest.fixture
@@ -207,12 +208,36 @@ def test_names_and_shapes_of_the_weights_are_stable():
     """Files saved today must load tomorrow."""
     shapes = {k: tuple(v.shape) for k, v in nl.DeepNRSfM(nl.Config(5, 3, 8, 4)).state_dict().items()}
     assert shapes == {
-        "beta": (24, 4), "gamma": (4,), "output_bias": (5, 3), "scale": (),
+        "beta": (24, 4), "gamma": (4,), "output_bias": (5, 3), "scale": (), "origin": (2,),
         "prior_mean": (9, 5, 3), "prior_covariance": (9, 15, 15), "prior_noise": (9,),
         "D.0": (8, 5, 3), "D.1": (8, 6), "D.2": (6, 4),
         "encoder_threshold.0": (8,), "encoder_threshold.1": (6,), "encoder_threshold.2": (4,),
         "decoder_threshold.0": (8,), "decoder_threshold.1": (6,),
     }  # fmt: skip
+
+
+def test_translations_add_a_row_to_every_block():
+    net = nl.DeepNRSfM(nl.Config(5, 3, 8, 4, translation=True))
+    assert net.beta.shape == (32, 4) and net.D[0].shape == (8, 5, 3)
+    W = torch.randn(7, 5, 2) + torch.tensor([3.0, -2.0])
+    Psi = net.encode(W)
+    assert Psi.shape == (7, 2, 4, 4)
+    first = net.first_dictionary().view(5, 4, 8)
+    torch.testing.assert_close(first[:, 3].abs(), torch.full((5, 8), EPSILON))
+    assert (first[:, 3] > 0).sum() == (first[:, 3] < 0).sum()  # else a negative translation vanishes in every block
+    S, M, t = net(W)
+    assert S.shape == (7, 5, 3) and M.shape == (7, 3, 2) and t.shape == (7, 2)
+    torch.testing.assert_close(S.mean(1), torch.zeros(7, 3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(t, W.mean(1))  # all visible: the image of the centroid is the mean
+
+
+def test_a_hidden_point_does_not_matter_and_a_weight_of_zero_hides(net, W):
+    visible = torch.ones(W.shape[:2], dtype=torch.bool)
+    visible[:, 1] = False
+    other = torch.where(visible[..., None], W, 1e6)
+    for a, b, c in zip(net(W, visible), net(other, visible), net(other, visible.float()), strict=True):
+        assert torch.equal(a, b)
+        torch.testing.assert_close(a, c)
 
 
 def test_save_and_load(net, W, tmp_path):

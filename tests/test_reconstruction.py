@@ -1,5 +1,7 @@
 """The front door: from points to a Reconstruction, and back to the points."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -111,7 +113,70 @@ def test_weak_perspective_scale_goes_into_the_shape(views):
     np.testing.assert_allclose(other.shapes / scale, rec.shapes, atol=1e-3)
 
 
+@pytest.mark.parametrize("projection", ["orthographic", "weak_perspective"])
+@pytest.mark.parametrize("seed", range(3))
+def test_projections_come_back_in_the_users_image_whatever_its_size_and_offset(views, projection, seed):
+    rng = np.random.default_rng(seed)
+    size, offset = 10 ** rng.uniform(-3, 4), 10 ** rng.uniform(0, 4) * rng.normal(size=2)
+    visible = rng.random((600, 31)) > 0.2
+    unit = nl.reconstruct(views.points2d, visible, projection=projection, steps=20, progress=False)
+    W = size * views.points2d + offset
+    model = copy.deepcopy(unit.model)
+    if projection == "orthographic":
+        model.scale *= size  # as training on W leaves it
+    rec = nl.reconstruct(W, visible, model=model, projection=projection)
+    misses = [np.linalg.norm((r.projections - w)[visible]) for r, w in ((unit, views.points2d), (rec, W))]
+    assert misses[1] / size == pytest.approx(misses[0], rel=1e-3)
+    residual = np.where(visible[..., None], rec.projections - W, 0.0)
+    np.testing.assert_allclose(residual.sum(1), 0, atol=1e-6 * (size + np.abs(offset).max()))  # the best translation
+
+
+def test_translations_are_found_and_their_model_is_kept(views, tmp_path):
+    moved = nl.datasets.make_views(nl.datasets.make_motion(600, seed=7), seed=7, translation_range=1.0)
+    rec = nl.reconstruct(moved, translation=True, steps=100, progress=False)
+    assert rec.model.config.translation
+    np.testing.assert_allclose(rec.translations, moved.translations, atol=1e-9)  # complete: the mean of the points
+    again = nl.Reconstruction.load(rec.save(tmp_path / "moved.npz"))
+    other = nl.reconstruct(moved, model=again.model)
+    np.testing.assert_allclose(other.shapes, rec.shapes, atol=1e-4)
+
+
+def test_a_wrong_point_without_confidence_does_not_matter(views, rec):
+    W, confidence = views.points2d.copy(), np.ones((600, 31))
+    W[::2, 5] += 1.0  # far off
+    trusted = nl.reconstruct(W, model=rec.model)
+    confidence[::2, 5] = 1e-4
+    doubted = nl.reconstruct(W, model=rec.model, confidence=confidence)
+    confidence[::2, 5] = 0
+    hidden = nl.reconstruct(W, model=rec.model, confidence=confidence)
+    errors = [nl.metrics.normalized_error(r.shapes, views.points3d).mean() for r in (trusted, doubted, hidden, rec)]
+    assert errors[0] > 2 * errors[1] and errors[1] < 1.3 * errors[3] and errors[2] < 1.3 * errors[3]
+    same = nl.reconstruct(views, visible=confidence > 0, model=rec.model)
+    np.testing.assert_allclose(same.shapes, hidden.shapes, atol=1e-9)
+
+
+def test_frames_with_few_points(views, rec):
+    visible = np.ones((20, 31), bool)
+    visible[3, 2:] = False
+    few = nl.reconstruct(views.points2d[:20], visible, model=rec.model)
+    assert np.isfinite(few.shapes).all()
+    size = np.linalg.norm(views.points3d[:20], axis=(1, 2))
+    assert np.linalg.norm(few.shapes[3]) < 2 * size.max()  # two points: a likely shape, seen from somewhere
+    visible[3, 1:] = False
+    with pytest.raises(ValueError, match="frame 3 of W has all its visible points at one place; leave it out"):
+        nl.reconstruct(views.points2d[:20], visible, model=rec.model)
+    visible[3] = False
+    with pytest.raises(ValueError, match="frame 3 of W has no visible point"):
+        nl.reconstruct(views.points2d[:20], visible, model=rec.model)
+
+
 def test_wrong_input_is_refused(views, rec):
+    with pytest.raises(ValueError, match=r"confidence is 2\.0 at frame 0, point 0; expected 0 to 1"):
+        nl.reconstruct(views, model=rec.model, confidence=np.full((600, 31), 2))
+    with pytest.raises(ValueError, match=r"confidence has shape \(600, 30\); expected \(600, 31\)"):
+        nl.reconstruct(views, model=rec.model, confidence=np.ones((600, 30)))
+    with pytest.raises(ValueError, match="no visible point with confidence"):
+        nl.reconstruct(views, model=rec.model, confidence=np.zeros((600, 31)))
     with pytest.raises(ValueError, match="refine='codes'; expected True, False or 'code'"):
         nl.reconstruct(views, model=rec.model, refine="codes")
     with pytest.raises(ValueError, match="no points2d"):

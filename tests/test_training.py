@@ -132,9 +132,27 @@ def test_hidden_points_do_not_change_the_result(views):
     assert torch.equal(nets[0].D[0], nets[1].D[0])
 
 
+def test_confidence_counts_in_training(views):
+    confidence = np.ones((200, 6))
+    confidence[:, 2] = 0.5
+    doubted = nl.Landmarks(views.points2d, confidence=confidence)
+    nets = [
+        nl.fit(views, config=SMALL, steps=10, progress=False),
+        nl.fit(views, config=SMALL, steps=10, confidence=confidence, progress=False),
+        nl.fit(doubted, config=SMALL, steps=10, progress=False),
+    ]
+    assert torch.equal(nets[1].D[0], nets[2].D[0]) and not torch.equal(nets[0].D[0], nets[1].D[0])
+
+
 def dead_frame():
     visible = np.ones((20, 6), bool)
     visible[7] = False
+    return visible
+
+
+def dead_point():
+    visible = np.ones((20, 6), bool)
+    visible[:, 4] = False
     return visible
 
 
@@ -153,6 +171,7 @@ def one_place():
         (np.full((20, 6, 2), 0.1), {}, "no shape to see"),
         (np.ones((20, 6, 2)), {"visible": dead_frame()}, "frame 7 of W has no visible point"),
         (np.ones((20, 6, 2)), {}, "no shape to see"),
+        (one_place(), {"visible": dead_point()}, "point 4 is hidden in every frame of W; leave it out"),
         (one_place(), {}, "frame 3 of W has all its visible points at one place"),
         (one_place()[:2], {}, "at least 10 frames and 4 points; got 2 frames of 6 points"),
         (one_place()[:, :3], {}, "got 20 frames of 3 points"),
