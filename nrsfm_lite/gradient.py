@@ -13,7 +13,7 @@ _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
 
 @torch.no_grad()
-def backpropagate(net, X, visible=None, size=None, pull=0.0):
+def backpropagate(net, image, visible=None, size=None, pull=0.0, X=None):
     """The training loss of a batch (paper, eq. 27); its gradient is left in the parameters' ``.grad``.
 
     ``mean_f ‖Ω (W_f − S_f M_f − 1 t_fᵀ)‖_F / size_f``, with the network's shape and camera of each frame and the
@@ -23,20 +23,23 @@ def backpropagate(net, X, visible=None, size=None, pull=0.0):
     Parameters
     ----------
     net : DeepNRSfM
-    X : (B, P, 2) tensor
-        Normalised points, zero where hidden.
+    image : (B, P, 2) tensor
+        What the encoder takes.
     visible : (B, P) tensor, optional
         Bool, or weights from 0 to 1, of which Ω holds the square roots. Default: everything.
     size : (B,) tensor, optional
         Default: ‖X_f‖_F, as in the authors' code. Ones give the paper's own loss.
     pull : float
         Weight of a second term, ``mean_f ‖S_f − S̄‖_F / size_f``, which draws shapes to the mean shape S̄.
+    X : (B, P, 2) tensor, optional
+        Normalised points that the loss compares with, if they are not the image itself.
 
     Returns
     -------
     Scalar tensor: the loss without the pull.
     """
-    B, P, _ = X.shape
+    B, P, _ = image.shape
+    X = image if X is None else X
     size = X.flatten(1).norm(dim=1) if size is None else size
     D0, *D = net.D
     b0, *b = net.encoder_threshold
@@ -46,9 +49,9 @@ def backpropagate(net, X, visible=None, size=None, pull=0.0):
     rows = net.config.block_rows
 
     # Forward, as in `model`. Every code is kept; thresholds work in place.
-    image = net.first_image(X, visible).mT.reshape(2 * B, P)
+    rows_of_image = image.mT.reshape(2 * B, P)
     first = net.first_dictionary()  # (P, rows K₁)
-    codes = [_threshold((image @ first).view(2 * rows * B, -1).sub_(b0), b0, soft)]
+    codes = [_threshold((rows_of_image @ first).view(2 * rows * B, -1).sub_(b0), b0, soft)]
     for Di, bi in zip(D, b, strict=True):
         codes.append(_threshold(torch.addmm(bi, codes[-1], Di, beta=-1), bi, soft))  # (2 rows B, K_i)
     Z = codes[-1]
@@ -106,7 +109,10 @@ def backpropagate(net, X, visible=None, size=None, pull=0.0):
         D[i].grad = dD[i].addmm_(codes[i].mT, g)
         g = g @ D[i].mT
     g = _mask(g, codes[0], b0, soft, minus).view(2 * B, -1)
-    dD0 += (image.mT @ g).view(P, rows, -1)[:, :3].permute(2, 0, 1)
+    encoder = (rows_of_image.mT @ g).view(P, rows, -1)[:, :3]
+    if net.config.translation:
+        encoder = encoder - encoder.mean(0)  # its atoms are centred
+    dD0 += encoder.permute(2, 0, 1)
     D0.grad = dD0
     return (missed / size).mean()
 

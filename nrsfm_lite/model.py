@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from . import preprocessing
+from . import completion, preprocessing
 from .cameras import nearest_orthonormal
 from .shape_prior import KINDS, Gaussian
 from .sparse_coding import mutual_coherence
@@ -42,6 +42,9 @@ class Config:
         Add a learned mean shape S̄ (the authors' code) to the last, linear layer.
     projection : "orthographic" or "weak_perspective"
         One scale for the whole set, or one per frame that goes into the shape.
+    fill : "likely", "zero" or "scaled"
+        What the encoder gets for a hidden point: its likely place, given the visible ones (chapter 11); zero, as
+        in the paper; or zero, and the visible points times their weights, scaled up so that these sum to P.
     translation : bool
         The 4×2 model: images are not centred, and a fourth row in every block takes the translation
         (paper, section on scale and translation; chapter 13).
@@ -60,6 +63,7 @@ class Config:
     threshold: str = "relu"
     output_bias: bool = True
     projection: str = "orthographic"
+    fill: str = "likely"
     translation: bool = False
 
     def __post_init__(self):
@@ -78,6 +82,7 @@ class Config:
             ("beta", ("full", "shared")),
             ("threshold", ("relu", "soft")),
             ("projection", ("orthographic", "weak_perspective")),
+            ("fill", ("likely", "zero", "scaled")),
         ]:
             if getattr(self, key) not in options:
                 raise ValueError(f"{key}={getattr(self, key)!r}; expected one of {', '.join(options)}.")
@@ -99,7 +104,8 @@ class DeepNRSfM(nn.Module):
     ``DeepNRSfM(n_points=31)`` takes the defaults, ``DeepNRSfM(Config(...))`` any setting. The
     parameters carry the names of the paper: `D` (list of dictionaries), `encoder_threshold`,
     `decoder_threshold`, `beta`, `gamma`, `output_bias`. What `fit` finds besides is kept in buffers: `scale`,
-    the unit of length, so that results come back in the user's units, and the shape prior (`prior`).
+    the unit of length, and `origin`, so that results come back in the user's units; `image_covariance`, to fill
+    in hidden points; and the shape prior (`prior`).
     The weights start Glorot-uniform as in the authors' code, drawn from `generator`; thresholds and S̄
     start at zero.
     """
@@ -125,6 +131,7 @@ class DeepNRSfM(nn.Module):
         self.output_bias = nn.Parameter(torch.zeros(P, 3), requires_grad=config.output_bias)
         self.register_buffer("scale", torch.ones(()))
         self.register_buffer("origin", torch.zeros(2))
+        self.register_buffer("image_covariance", torch.eye(P) - 1 / P)
         n = 1 + KINDS
         self.register_buffer("prior_mean", torch.zeros(n, P, 3))
         self.register_buffer("prior_covariance", torch.zeros(n, 3 * P, 3 * P))
@@ -164,33 +171,30 @@ class DeepNRSfM(nn.Module):
             self.prior_mean[i], self.prior_covariance[i] = gaussian.mean, gaussian.covariance
             self.prior_noise[i] = gaussian.noise
 
-    def encode(self, X, visible=None):
-        """Block sparse code of normalised points: (B, P, 2) -> Psi_N (B, 2, 3, K_N), with translations (B, 2, 4, K_N).
+    def encode(self, X):
+        """Block sparse code of images (B, P, 2) as `normalize` makes them: Psi_N (B, 2, 3, K_N); 4×2 (B, 2, 4, K_N).
 
         One step of block ISTA per layer. The columns of a block come before its rows here, so that
-        every layer is one matrix product over the flattened batch (chapter 06). `visible` (B, P) is
-        bool or holds weights from 0 to 1; `X` is zero where it is.
+        every layer is one matrix product over the flattened batch (chapter 06).
         """
         B, P, _ = X.shape
         n = 2 * self.config.block_rows * B
-        Z = self.first_image(X, visible).mT.reshape(2 * B, P) @ self.first_dictionary()  # (2B, rows K₁)
+        Z = X.mT.reshape(2 * B, P) @ self.first_dictionary()  # (2B, rows K₁)
         Z = self._threshold(Z.view(n, -1), self.encoder_threshold[0])  # (n, K₁)
         for D, b in zip(list(self.D)[1:], list(self.encoder_threshold)[1:], strict=True):
             Z = self._threshold(Z @ D, b)  # (n, K_i)
         return Z.view(B, 2, self.config.block_rows, -1)
 
-    def first_image(self, X, visible=None):
-        """What the first layer takes in: points times weights, times P over the sum of weights (chapter 11)."""
-        if visible is None:
-            return X
-        weight = visible.to(X.dtype)
-        share = weight.mean(1).clamp(min=1e-6)
-        return X * (weight / share[:, None])[..., None]
-
     def first_dictionary(self):
-        """D₁ as the first layer multiplies with it: (P, 3 K₁), or (P, 4 K₁) with the row of translations."""
+        """D₁ as the first layer multiplies with it: (P, 3 K₁), or (P, 4 K₁) with the row of translations.
+
+        In the 4×2 model every atom is centred, so that rows 1 to 3 do not see the translation of a complete
+        image, and the fourth sees nothing else. Its signs alternate: with one sign and ReLU, a negative
+        translation would vanish in all blocks.
+        """
         D1 = self.D[0].permute(1, 2, 0)  # (P, 3, K₁)
         if self.config.translation:
+            D1 = D1 - D1.mean(0)
             sign = 1.0 - 2 * (torch.arange(D1.shape[2], device=D1.device) % 2)
             D1 = torch.cat([D1, (EPSILON * sign).to(D1).expand(len(D1), 1, -1)], 1)
         return D1.reshape(len(D1), -1)
@@ -219,15 +223,36 @@ class DeepNRSfM(nn.Module):
         return S.view(-1, *self.output_bias.shape) + self.output_bias
 
     def normalize(self, W, visible):
-        """Scaled points, centred but for a model of translations, zero where hidden; and each frame's scale (B,)."""
-        X, _ = preprocessing.center(W, visible)
+        """From image coordinates to the network's.
+
+        Returns
+        -------
+        image : (B, P, 2)
+            What the encoder takes: hidden points filled in, centred but for a model of translations.
+        X : (B, P, 2)
+            Points centred over the visible ones, zero where hidden: what the loss and the prior compare with.
+        scale : (B,)
+        """
+        X, mean = preprocessing.center(W, visible)
         if self.config.projection == "orthographic":
             scale = self.scale.expand(X.shape[0])  # not len(X), which `torch.export` would fix
         else:
             scale = preprocessing.frame_scale(X, visible)
+        X = X / scale[:, None, None]
+        if not torch.compiler.is_exporting() and (visible == 1).all():
+            image = X  # the shortcut is the same, but an exported graph has no branches
+        elif self.config.fill == "likely":
+            image = completion.fill(self.image_covariance.double(), X, visible)
+        else:
+            weight = visible.to(X.dtype)
+            unit = weight.mean(1, keepdim=True) if self.config.fill == "scaled" else 1.0
+            image = X * (weight / unit)[..., None]
         if self.config.translation:
-            X = torch.where((visible > 0)[..., None], W - self.origin, 0.0)
-        return X / scale[:, None, None], scale
+            moved = preprocessing.visible_mean(X - image, visible)  # back to where the visible points are
+            image = image + (moved + (mean - self.origin) / scale[:, None])[:, None]
+            if self.config.fill != "likely":
+                image = image * (visible > 0)[..., None]
+        return image, X, scale
 
     def forward(self, W, visible=None):
         """Shapes, cameras and translations of image points.
@@ -235,7 +260,8 @@ class DeepNRSfM(nn.Module):
         Parameters
         ----------
         W : (B, P, 2) tensor in image coordinates
-        visible : (B, P) bool tensor, optional
+        visible : (B, P) tensor, optional
+            Bool, or weights from 0 to 1.
 
         Returns
         -------
@@ -244,8 +270,8 @@ class DeepNRSfM(nn.Module):
         """
         if visible is None:
             visible = torch.ones(W.shape[:2], dtype=torch.bool, device=W.device)
-        X, scale = self.normalize(W, visible)
-        psi, M = self.bottleneck(self.encode(X, visible))
+        image, _, scale = self.normalize(W, visible)
+        psi, M = self.bottleneck(self.encode(image))
         S = self.decode(psi)
         S = (S - S.mean(1, keepdim=True)) * scale[:, None, None]
         t = preprocessing.visible_mean(W - S @ M, visible)  # the best t in closed form
@@ -296,7 +322,7 @@ class DeepNRSfM(nn.Module):
         """The network that `to_arrays` took apart."""
         weights = {k: torch.as_tensor(v) for k, v in weights.items()}
         net = cls(Config(**config), generator=torch.Generator()).to(weights["scale"].dtype)
-        # Files of earlier versions have no prior and no origin.
-        older = {k: v for k, v in net.state_dict().items() if k.startswith(("prior_", "origin"))}
+        # Files of earlier versions lack these.
+        older = {k: v for k, v in net.state_dict().items() if k.startswith(("prior_", "origin", "image_"))}
         net.load_state_dict(older | weights)
         return net.eval()

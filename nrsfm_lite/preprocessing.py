@@ -48,6 +48,14 @@ def _weighted_squares(X, visible):
     return (X.square().sum(2) * visible).sum(1)
 
 
+def check_points(visible, names=()):
+    """Raise ValueError, naming it, where a point is hidden in every frame; `visible` (F, P) is bool or weights."""
+    hidden = (visible == 0).all(0)
+    if hidden.any():
+        point = int(hidden.nonzero()[0])
+        raise ValueError(f"point {names[point] if names else point} is hidden in every frame of W; leave it out.")
+
+
 def check_extent(W, visible):
     """Raise ValueError, naming the frame, where all visible points of a frame are at one place.
 

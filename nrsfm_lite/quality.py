@@ -66,10 +66,9 @@ def best(models, W, visible=None):
 @torch.no_grad()
 def image_error(model, W, visible=None):
     """Mean over frames of ‖W − S M − 1tᵀ‖ / ‖W‖ over the visible points: the training loss of one forward pass."""
-    X, weight = _normalized(model, W, visible)
-    S, M, _ = _forward(model, X, weight)
+    image, X, weight = _normalized(model, W, visible)
+    S, M, _ = _forward(model, image)
     missed, _ = center(X - S @ M, weight)
-    X, _ = center(X, weight)
     return float((frame_size(missed, weight) / frame_size(X, weight)).mean())
 
 
@@ -81,7 +80,7 @@ def consistency(model, W, visible=None, seed=0):
     over frames of ‖S' − S‖ / ‖S‖, in the network's own coordinates, so that a turned or mirrored answer
     counts as an error.
     """
-    S, _, _ = _forward(model, *_normalized(model, W, visible))
+    S, _, _ = _forward(model, _normalized(model, W, visible)[0])
     cameras = torch.as_tensor(random_cameras(len(S), seed)).to(S)
     again, _, _ = _forward(model, S @ cameras)
     return _relative(again, S)
@@ -90,17 +89,17 @@ def consistency(model, W, visible=None, seed=0):
 @torch.no_grad()
 def turn_consistency(model, W, visible=None, seed=0):
     """Is an image, turned in its plane by a random angle, given the same shape? Mean of ‖S' − S‖ / ‖S‖."""
-    X, weight = _normalized(model, W, visible)
-    angle = torch.as_tensor(np.random.default_rng(seed).uniform(0, 2 * np.pi, len(X))).to(X)
-    S, _, _ = _forward(model, X, weight)
-    again, _, _ = _forward(model, X @ image_turns(angle), weight)
+    image, _, _ = _normalized(model, W, visible)
+    angle = torch.as_tensor(np.random.default_rng(seed).uniform(0, 2 * np.pi, len(image))).to(image)
+    S, _, _ = _forward(model, image)
+    again, _, _ = _forward(model, image @ image_turns(angle))
     return _relative(again, S)
 
 
 @torch.no_grad()
 def distortion(model, W, visible=None):
     """How far the cameras are from orthonormal before the projection makes them so: mean (σ₁ − σ₂) / (σ₁ + σ₂)."""
-    A = (model.encode(*_normalized(model, W, visible)) @ model.gamma)[:, :, :3].mT
+    A = (model.encode(_normalized(model, W, visible)[0]) @ model.gamma)[:, :, :3].mT
     sigma = torch.linalg.svdvals(A)  # (B, 2)
     return float(((sigma[:, 0] - sigma[:, 1]) / sigma.sum(1).clamp(min=1e-12)).mean())
 
@@ -108,7 +107,7 @@ def distortion(model, W, visible=None):
 @torch.no_grad()
 def code_dimension(model, W, visible=None):
     """In how many directions the codes spread: (Σλ)² / Σλ² of the eigenvalues of their covariance."""
-    _, _, psi = _forward(model, *_normalized(model, W, visible))
+    _, _, psi = _forward(model, _normalized(model, W, visible)[0])
     values = torch.linalg.eigvalsh(torch.cov(psi.double().T)).clamp(min=0)
     return float(values.sum() ** 2 / values.square().sum().clamp(min=1e-300))
 
@@ -122,23 +121,24 @@ def surprise(model, W, visible=None):
     prior = model.prior
     if prior is None:
         return float("nan")
-    X, weight = _normalized(model, W, visible)
-    _, M, _ = _forward(model, X, weight)
-    X, weight = center(X, weight)[0].cpu(), weight.cpu()  # where the prior works
+    image, X, weight = _normalized(model, W, visible)
+    _, M, _ = _forward(model, image)
+    X, weight = X.cpu(), weight.cpu()  # where the prior works
     _, M = shape_prior.apply(prior, X, weight, M.cpu())
     return shape_prior.surprise(prior, X, weight, M)
 
 
 def _normalized(model, W, visible):
-    """Points in the network's units and their weights, where the network is."""
+    """`normalize` of the points, and their weights, where the network is."""
     weight = torch.as_tensor(as_weights(W, visible)).to(model.scale.device)
     W = torch.as_tensor(as_points(W, visible)[0]).to(model.scale.device)
-    return model.normalize(W, weight)[0].to(model.gamma.dtype), weight.to(model.gamma.dtype)
+    image, X, _ = model.normalize(W, weight)
+    return image.to(model.gamma.dtype), X.to(model.gamma.dtype), weight.to(model.gamma.dtype)
 
 
-def _forward(model, X, weight=None):
+def _forward(model, image):
     """Centred shapes, cameras and codes in the network's units."""
-    psi, M = model.bottleneck(model.encode(X, weight))
+    psi, M = model.bottleneck(model.encode(image))
     S = model.decode(psi)
     return S - S.mean(1, keepdim=True), M, psi
 

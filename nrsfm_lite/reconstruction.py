@@ -94,8 +94,8 @@ def reconstruct(
             refine = None if adapt else model.prior
             if refine is None:
                 device = model.scale.device
-                X = model.normalize(W.to(device), weight.to(device))[0].cpu()
-                refine = learn_prior(model, X, weight, torch.Generator().manual_seed(seed))
+                image, X, _ = model.normalize(W.to(device), weight.to(device))
+                refine = learn_prior(model, image, X.cpu(), weight, torch.Generator().manual_seed(seed))
         F, P, _ = W.shape
         S, M, t = np.empty((F, P, 3)), np.empty((F, 3, 2)), np.empty((F, 2))
         for first in range(0, F, _CHUNK):
@@ -130,10 +130,9 @@ def infer(model, W, visible, refine=False):
     S (B, P, 3) centred, M (B, 3, 2), t (B, 2): tensors in the units of W.
     """
     device = model.scale.device
-    X, scale = model.normalize(W.to(device), visible.to(device))
+    image, X, scale = model.normalize(W.to(device), visible.to(device))
     with torch.no_grad():
-        psi, M = model.bottleneck(model.encode(X.to(model.scale.dtype), visible.to(device)))
-    X, _ = preprocessing.center(X, visible.to(device))
+        psi, M = model.bottleneck(model.encode(image.to(model.scale.dtype)))
     if isinstance(refine, tuple):
         S, M = shape_prior.apply(refine, X.cpu(), visible, M.cpu())
     else:

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from tqdm import tqdm
 
-from . import preprocessing, shape_prior
+from . import completion, preprocessing, shape_prior
 from .cameras import image_turns
 from .data import as_points, as_weights
 from .gradient import backpropagate
@@ -143,10 +143,7 @@ def fit(
     if device is None:
         device = "cuda" if torch.cuda.is_available() else "cpu"
 
-    unseen = (weight == 0).all(0)
-    if unseen.any():
-        point = int(unseen.nonzero()[0])
-        raise ValueError(f"point {names[point] if names else point} is hidden in every frame of W; leave it out.")
+    preprocessing.check_points(weight, names)
     preprocessing.check_extent(W, weight)
     seed = int(seed)
     random = torch.Generator().manual_seed(seed)
@@ -154,16 +151,16 @@ def fit(
     X, mean = preprocessing.center(W, weight)
     net.scale.fill_(preprocessing.set_scale(X, weight))
     net.origin.copy_(mean.mean(0))
-    X, _ = net.normalize(W, weight)
-    centred, _ = preprocessing.center(X, weight)
-    size = preprocessing.frame_size(centred, weight).float().to(device)
+    net.image_covariance.copy_(completion.learn(X / net.scale, weight))
+    image, X, _ = net.normalize(W, weight)
+    size = preprocessing.frame_size(X, weight).float().to(device)
     complete = bool((weight == 1).all())
-    X, weight = X.float().to(device), weight.float().to(device)
+    image, X, weight = image.float().to(device), X.float().to(device), weight.float().to(device)
     net.to(device)
     optimizers = make_optimizers(net, plan)
     decay = warmup_cosine(steps) if plan.optimizer == "muon" else _exponential
     rates = [torch.optim.lr_scheduler.LambdaLR(o, decay) for o in optimizers]
-    key = _fingerprint(config, plan, steps, seed, X, weight) if checkpoint else None
+    key = _fingerprint(config, plan, steps, seed, image, weight) if checkpoint else None
     first = _resume(checkpoint, key, net, optimizers, rates, random)
 
     running, skipped = None, 0
@@ -171,11 +168,12 @@ def fit(
     with use_threads(threads):
         for step in bar:
             pick = torch.randint(F, (min(plan.batch, F),), generator=random).to(device)
-            batch = X[pick]
+            seen, compared = image[pick], X[pick]
             if step < plan.turn * steps:
-                batch = batch @ image_turns(2 * math.pi * torch.rand(len(pick), generator=random)).to(batch)
+                turns = image_turns(2 * math.pi * torch.rand(len(pick), generator=random)).to(seen)
+                seen, compared = seen @ turns, compared @ turns
             pull = plan.pull * max(0.0, 1 - 2 * step / steps)
-            loss = backpropagate(net, batch, None if complete else weight[pick], size[pick], pull)
+            loss = backpropagate(net, seen, None if complete else weight[pick], size[pick], pull, compared)
             norm = torch.nn.utils.clip_grad_norm_(net.parameters(), plan.clip)
             if torch.isfinite(norm):  # a camera one step from degenerate can ask for an infinite step
                 for optimizer in optimizers:
@@ -199,28 +197,26 @@ def fit(
         for p in net.parameters():
             p.data = p.data.clone()  # no longer a piece of the optimiser's vector
         net.cpu().eval()
-        net.prior = learn_prior(net, X.cpu(), weight.cpu(), random)
+        net.prior = learn_prior(net, image.cpu(), X.cpu(), weight.cpu(), random)
     return net
 
 
 @torch.no_grad()
-def learn_prior(net, X, visible, random=None):
+def learn_prior(net, image, X, visible, random=None):
     """The shape prior of some frames, from a trained network's shapes and cameras of at most 4,000 of them.
 
     Parameters
     ----------
     net : DeepNRSfM
-    X : (F, P, 2) tensor
-        Normalised points, zero where hidden.
+    image, X : (F, P, 2) tensors
+        As `net.normalize` makes them.
     visible : (F, P) tensor, bool or weights from 0 to 1
     random : torch.Generator, optional
         Draws the frames.
     """
     pick = torch.randperm(len(X), generator=random)[:PRIOR_FRAMES]
-    X, visible = X[pick], visible[pick]
-    psi, M = net.bottleneck(net.encode(X.to(net.scale), visible.to(net.scale.device)))
-    X, _ = preprocessing.center(X, visible)
-    return shape_prior.learn(X, visible, net.decode(psi).cpu(), M.cpu())
+    psi, M = net.bottleneck(net.encode(image[pick].to(net.scale)))
+    return shape_prior.learn(X[pick], visible[pick], net.decode(psi).cpu(), M.cpu())
 
 
 class FlatAdam(torch.optim.Adam):

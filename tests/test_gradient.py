@@ -25,7 +25,7 @@ def network(dtype=torch.double, **settings):
 
 
 def by_autograd(net, X, visible, size, pull=0.0):
-    psi, M = net.bottleneck(net.encode(X, visible))
+    psi, M = net.bottleneck(net.encode(X))
     residual = X - net.decode(psi) @ M
     if visible is not None or net.config.translation:
         weight = torch.ones(X.shape[:2]).to(X) if visible is None else visible.to(X)

@@ -208,7 +208,7 @@ def test_names_and_shapes_of_the_weights_are_stable():
     """Files saved today must load tomorrow."""
     shapes = {k: tuple(v.shape) for k, v in nl.DeepNRSfM(nl.Config(5, 3, 8, 4)).state_dict().items()}
     assert shapes == {
-        "beta": (24, 4), "gamma": (4,), "output_bias": (5, 3), "scale": (), "origin": (2,),
+        "beta": (24, 4), "gamma": (4,), "output_bias": (5, 3), "scale": (), "image_covariance": (5, 5), "origin": (2,),
         "prior_mean": (9, 5, 3), "prior_covariance": (9, 15, 15), "prior_noise": (9,),
         "D.0": (8, 5, 3), "D.1": (8, 6), "D.2": (6, 4),
         "encoder_threshold.0": (8,), "encoder_threshold.1": (6,), "encoder_threshold.2": (4,),

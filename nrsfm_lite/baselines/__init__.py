@@ -1,6 +1,6 @@
 """Classical methods, in one signature: (W or Landmarks, visible=None, **own) -> Reconstruction."""
 
-from .completion import complete
+from ..completion import complete
 from .pta import pta
 from .rigid import tomasi_kanade
 

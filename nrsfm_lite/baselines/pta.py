@@ -4,8 +4,8 @@ import numpy as np
 from scipy.fft import idct
 from scipy.optimize import minimize
 
+from ..completion import complete
 from ..data import Reconstruction, as_points
-from .completion import complete
 
 
 def pta(W, visible=None, rank=12):

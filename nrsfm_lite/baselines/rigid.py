@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from ..cameras import nearest_orthonormal
+from ..completion import complete
 from ..data import Reconstruction, as_points
-from .completion import complete
 
 
 def tomasi_kanade(W, visible=None):

@@ -56,7 +56,7 @@ def _child(pipe, frames, refine):
     net = DeepNRSfM(n_points=_POINTS).eval()
     some = torch.as_tensor(W[:_PRIOR_FRAMES])
     visible = torch.ones(some.shape[:2], dtype=torch.bool)
-    net.prior = learn_prior(net, net.normalize(some, visible)[0], visible)  # as `fit` leaves it, all kinds in use
+    net.prior = learn_prior(net, *net.normalize(some, visible)[:2], visible)  # as `fit` leaves it, all kinds in use
     reconstruct(W[:100], model=net, refine=refine)  # libraries load on first use
     before = _peak_mb()
     start = time.perf_counter()

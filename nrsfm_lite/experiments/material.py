@@ -84,9 +84,46 @@ def default_schedule(rates=1.0, **changes):
     return replace(plan, rate=rates * plan.rate, muon_rate=rates * plan.muon_rate, **changes)
 
 
-def views(data):
+def views(data, **how):
     """Training frames (the first 80 % of the sequences) and unseen ones, each under its own random camera."""
-    return datasets.make_views(load(data), seed=0).split()
+    return datasets.make_views(load(data), seed=0, **how).split()
+
+
+def train_and_score(data, seed, how, **config):
+    """The default network on views made as `how` says, and its errors; the truth is used for these only.
+
+    Returns
+    -------
+    net, dict of mean normalised 3D errors: `seen` (training frames, one pass), `refined` (as `reconstruct`
+    does), `unseen` and `refined_unseen` (the other frames), each of them again with `_hidden` for the hidden
+    points alone (empty if there are none), and `shift`, the mean distance of the training frames' translations
+    from the true ones, as a share of the object's largest extent.
+    """
+    train, test = views(data, **how)
+    settings = Config(train.n_points, **config)
+    net = fit(train, config=settings, steps=quick_steps(data), seed=seed, progress=False)
+    result = {}
+    for key, frames, refine in [
+        ("seen", train, False),
+        ("unseen", test, False),
+        ("refined", train, True),
+        ("refined_unseen", test, True),
+    ]:
+        rec = reconstruct(frames, model=net, refine=refine)
+        result |= hidden_errors(key, rec.shapes, frames)
+        if key == "refined":
+            missed = np.linalg.norm(rec.translations - frames.translations, axis=1)
+            result["shift"] = float(missed.mean() / np.ptp(frames.points3d, axis=1).max())
+    return net, result
+
+
+def hidden_errors(key, S, frames):
+    """Mean normalised error under `key`, and that of the hidden points alone under `key`_hidden."""
+    whole = float(metrics.normalized_error(S, frames.points3d).mean())
+    if frames.visible.all():
+        return {key: whole, f"{key}_hidden": ""}
+    hidden = metrics.normalized_error(S, frames.points3d, points=~frames.visible)
+    return {key: whole, f"{key}_hidden": float(np.nanmean(hidden))}
 
 
 def variants(setting, values, seeds, quick):

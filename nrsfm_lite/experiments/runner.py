@@ -26,7 +26,10 @@ import torch
 
 from . import material
 
-NAMES = ("speed", "inference", "thresholds", "relaxation", "training", "coherence", "stress", "unseen")
+NAMES = (
+    *("speed", "inference", "thresholds", "relaxation", "training", "coherence", "stress", "unseen"),
+    *("missing", "translation", "noise"),
+)
 _LIBRARIES = ("torch", "numpy", "scipy")
 
 

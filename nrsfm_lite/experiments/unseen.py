@@ -70,7 +70,7 @@ def _train(views, change, steps, seed):
     W = torch.as_tensor(views.points2d)
     visible = torch.ones(W.shape[:2], dtype=torch.bool)
     net.scale.fill_(set_scale(W - W.mean(1, keepdim=True), visible))
-    X = net.normalize(W, visible)[0].float()
+    X = net.normalize(W, visible)[1].float()
     depth = torch.as_tensor(_depths(views)).float() / net.scale
     optimizers = make_optimizers(net, plan)
     rates = [torch.optim.lr_scheduler.LambdaLR(o, warmup_cosine(steps)) for o in optimizers]
@@ -156,7 +156,7 @@ def _errors(nets, change, train, test):
 def _guess(nets, change, views):
     """Normalised points, shapes and cameras; those of an ensemble turned onto the first network's and averaged."""
     W = torch.as_tensor(views.points2d)
-    X, _ = nets[0].normalize(W, torch.ones(W.shape[:2], dtype=torch.bool))
+    _, X, _ = nets[0].normalize(W, torch.ones(W.shape[:2], dtype=torch.bool))
     X = X.float()
     S_sum, M_sum = 0.0, 0.0
     for net in nets:

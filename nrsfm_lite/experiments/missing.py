@@ -1,0 +1,68 @@
+"""Missing points: how much of the shape is left when 1 to 7 of 31 points, a third, or half are hidden (chapter 11)."""
+
+import numpy as np
+
+from .. import baselines
+from ..data import Landmarks
+from . import material
+
+QUESTION = "How does the error grow with the number of hidden points, and what should the encoder see in their place?"
+_HIDDEN = ("0", "1", "2", "3", "4", "5", "6", "7", "0.3", "0.5", "self")
+_COMPARED = ("7", "0.5")
+
+
+def cases(quick):
+    """Data, what is hidden, method and seed."""
+    if quick:
+        methods = ("likely", "zero", "scaled", "completed", "rigid")
+        return [{"data": "motion-small", "hidden": "7", "method": m, "seed": 0} for m in methods]
+    rows = []
+    for seed in range(3):
+        rows += [(h, "likely", seed) for h in _HIDDEN]
+        rows += [(h, m, seed) for h in _COMPARED for m in ("zero", "scaled", "completed")]
+    rows += [(h, "rigid", 0) for h in _HIDDEN]
+    return [{"data": "martial", "hidden": h, "method": m, "seed": s} for h, m, s in rows]
+
+
+def conditions(quick):
+    """What all cases share."""
+    return {
+        "hidden": "a whole number m: 1 to m points per frame, uniformly; a share: so many in every frame; self: "
+        "points that the body's own rods are in front of",
+        "method": "likely, zero, scaled: the network, and what its encoder gets for a hidden point (Config.fill); "
+        "completed: all hidden points completed first, then taken for visible; rigid: one rigid shape after completion",
+        "errors": "normalised 3D error over all points; _hidden: over the hidden ones, in the same unit",
+        "steps": material.QUICK_STEPS if quick else "the default schedule's",
+    }
+
+
+def measure(data, hidden, method, seed):
+    """Errors of one training, or of the rigid baseline."""
+    missing = hidden if hidden == "self" else float(hidden) if "." in hidden else int(hidden)
+    if method in ("likely", "zero", "scaled"):
+        _, result = material.train_and_score(data, seed, {"missing": missing}, fill=method)
+        return result
+    train, test = material.views(data, missing=missing)
+    keys = ("seen", "unseen", "refined", "refined_unseen")
+    result = {k: "" for key in keys for k in (key, f"{key}_hidden")} | {"shift": ""}
+    if method == "rigid":
+        return result | material.hidden_errors("seen", baselines.tomasi_kanade(train).shapes, train)
+    net = material.fit(_complete(train), steps=material.quick_steps(data), seed=seed, progress=False)
+    for key, frames in (("refined", train), ("refined_unseen", test)):
+        S = material.reconstruct(_complete(frames), model=net).shapes
+        result |= material.hidden_errors(key, S, frames)
+    return result
+
+
+def report(rows):
+    """Mean and spread over seeds, a line per number of hidden points and method."""
+    lines = []
+    for hidden, method in dict.fromkeys((r["hidden"], r["method"]) for r in rows):
+        chosen = [r for r in rows if (r["hidden"], r["method"]) == (hidden, method)]
+        words = material.mean_and_spread(chosen, ("seen", "refined", "refined_hidden", "refined_unseen"))
+        lines.append(f"{hidden} hidden, {method}, {len(chosen)} seeds: {words}")
+    return "\n".join(lines)
+
+
+def _complete(frames):
+    return Landmarks(np.asarray(baselines.complete(frames)))

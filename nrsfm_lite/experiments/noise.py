@@ -1,0 +1,68 @@
+"""Noisy images: trained and tested at each level (chapter 14)."""
+
+import torch
+
+from .. import baselines
+from . import material
+
+QUESTION = "How does the error grow with the noise of the images, and what do the thresholds do about it?"
+_LEVELS = (0.0, 0.05, 0.1, 0.2, 0.3)
+
+
+def cases(quick):
+    """Data, noise, method and seed."""
+    data, levels, seeds = ("motion-small", (0.2,), 1) if quick else ("martial", _LEVELS, 3)
+    rows = [(n, "network", s) for s in range(seeds) for n in levels]
+    rows += [(n, m, 0) for m in ("rigid", "pta") for n in levels]
+    return [{"data": data, "noise": n, "method": m, "seed": s} for n, m, s in rows]
+
+
+def conditions(quick):
+    """What all cases share."""
+    return {
+        "noise": "norm of the noise over that of the centred image points, in every frame",
+        "errors": "normalised 3D error against the noiseless shapes",
+        "first_threshold": "mean of the first encoder threshold; active: share of positive entries of the first code",
+        "pta": "rank 12, on frames in their order, each from its own camera, for which it is not made",
+        "steps": material.QUICK_STEPS if quick else "the default schedule's",
+    }
+
+
+def measure(data, noise, method, seed):
+    """Errors of one training, or of a baseline."""
+    if method == "network":
+        net, result = material.train_and_score(data, seed, {"noise": noise})
+        return {k: v for k, v in result.items() if not k.endswith("_hidden")} | _sparsity(net, data, noise)
+    train, _ = material.views(data, noise=noise)
+    rec = baselines.tomasi_kanade(train) if method == "rigid" else baselines.pta(train)
+    keys = ("seen", "unseen", "refined", "shift", "refined_unseen", "first_threshold", "active", "found_noise")
+    seen = material.hidden_errors("seen", rec.shapes, train)["seen"]
+    return dict.fromkeys(keys, "") | {"seen": seen}
+
+
+def report(rows):
+    """Mean and spread over seeds, a line per level and method."""
+    lines = []
+    for noise, method in dict.fromkeys((r["noise"], r["method"]) for r in rows):
+        chosen = [r for r in rows if (r["noise"], r["method"]) == (noise, method)]
+        keys = ("seen", "refined", "refined_unseen", "first_threshold", "active", "found_noise")
+        words = material.mean_and_spread(chosen, keys if method == "network" else keys[:1])
+        lines.append(f"noise {noise}, {method}, {len(chosen)} seeds: {words}")
+    return "\n".join(lines)
+
+
+@torch.no_grad()
+def _sparsity(net, data, noise):
+    """Thresholds, active entries, and σ of the shape prior over the root mean square of image coordinates."""
+    train, _ = material.views(data, noise=noise)
+    W = torch.as_tensor(train.points2d[::20])
+    image, _, _ = net.normalize(W, torch.ones(W.shape[:2]))
+    code = torch.relu(
+        (image.float().mT.reshape(-1, train.n_points) @ net.first_dictionary()).view(-1, net.config.first_atoms)
+        - net.encoder_threshold[0]
+    )
+    return {
+        "first_threshold": float(net.encoder_threshold[0].mean()),
+        "active": float((code > 0).float().mean()),
+        "found_noise": net.prior[0].noise ** 0.5,
+    }
