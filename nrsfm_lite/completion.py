@@ -13,6 +13,7 @@ import torch
 
 from . import preprocessing
 from .data import as_points
+from .threads import use_threads
 
 _ITERATIONS = 30
 _FRAMES = 4000  # at most, drawn evenly
@@ -110,7 +111,8 @@ def complete(W, visible=None):
     preprocessing.check_extent(W, seen)
     X, _ = preprocessing.center(W, seen)
     scale = preprocessing.set_scale(X, seen)
-    filled = fill(learn(X / scale, seen), X / scale, seen) * scale
+    with use_threads(1):
+        filled = fill(learn(X / scale, seen), X / scale, seen) * scale
     moved = preprocessing.visible_mean(W - filled, seen)  # back to where the visible points are
     return torch.where(seen[..., None], W, filled + moved[:, None]).numpy()
 

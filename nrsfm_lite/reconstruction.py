@@ -7,7 +7,8 @@ from . import preprocessing, shape_prior
 from .cameras import nearest_orthonormal
 from .data import Landmarks, Reconstruction, as_points, as_weights
 from .model import Config
-from .training import fit, learn_prior, use_threads
+from .threads import use_threads
+from .training import fit, learn_prior
 
 _CHUNK = 4096  # frames per pass: memory stays flat in the number of frames
 _REFINE_STEPS = 150

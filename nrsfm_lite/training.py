@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import os
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from .cameras import image_turns
 from .data import as_points, as_weights
 from .gradient import backpropagate
 from .model import Config, DeepNRSfM
+from .threads import use_threads
 
 MIN_FRAMES = 10
 MIN_POINTS = 4
@@ -151,8 +151,9 @@ def fit(
     X, mean = preprocessing.center(W, weight)
     net.scale.fill_(preprocessing.set_scale(X, weight))
     net.origin.copy_(mean.mean(0))
-    net.image_covariance.copy_(completion.learn(X / net.scale, weight))
-    image, X, _ = net.normalize(W, weight)
+    with use_threads(threads):
+        net.image_covariance.copy_(completion.learn(X / net.scale, weight))
+        image, X, _ = net.normalize(W, weight)
     size = preprocessing.frame_size(X, weight).float().to(device)
     complete = bool((weight == 1).all())
     image, X, weight = image.float().to(device), X.float().to(device), weight.float().to(device)
@@ -300,15 +301,3 @@ def _resume(path, key, net, optimizers, rates, random):
         part.load_state_dict(saved)
     random.set_state(state["random"])
     return state["step"]
-
-
-@contextmanager
-def use_threads(n):
-    """Let PyTorch use n CPU threads inside a `with` block (None: as it is), and set it back afterwards."""
-    before = torch.get_num_threads()
-    if n is not None:
-        torch.set_num_threads(n)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

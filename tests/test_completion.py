@@ -6,6 +6,13 @@ import torch
 
 import nrsfm_lite as nl
 from nrsfm_lite import completion, preprocessing
+from nrsfm_lite.threads import use_threads
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    with use_threads(1):
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,8 @@ import torch
 
 from ..gradient import backpropagate
 from ..model import DeepNRSfM
-from ..training import SCHEDULES, make_optimizers, use_threads
+from ..threads import use_threads
+from ..training import SCHEDULES, make_optimizers
 from .convolution import ConvolutionNet
 
 QUESTION = "How far is a training step from its bare matrix products, and from the paper's convolutions?"

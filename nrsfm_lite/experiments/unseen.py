@@ -9,7 +9,8 @@ from .. import metrics, shape_prior
 from ..cameras import image_turns, nearest_orthonormal, random_cameras
 from ..model import Config, DeepNRSfM
 from ..preprocessing import set_scale
-from ..training import PRIOR_FRAMES, SCHEDULES, make_optimizers, use_threads, warmup_cosine
+from ..threads import use_threads
+from ..training import PRIOR_FRAMES, SCHEDULES, make_optimizers, warmup_cosine
 from . import material
 
 QUESTION = "Which changes of the training, or of the network, help on unseen frames? Would 3D supervision?"
