@@ -8,6 +8,7 @@ from . import material
 
 QUESTION = "How does the error grow with the number of hidden points, and what should the encoder see in their place?"
 _HIDDEN = ("0", "1", "2", "3", "4", "5", "6", "7", "0.3", "0.5", "self")
+_BETWEEN = ("1", "2", "4", "5", "6", "self")
 _METHODS = ("zero", "scaled", "completed")
 
 
@@ -16,11 +17,10 @@ def cases(quick):
     if quick:
         methods = ("likely", *_METHODS, "rigid")
         return [{"data": "motion-small", "hidden": "7", "method": m, "seed": 0} for m in methods]
-    rows = []
-    for seed in range(3):
-        rows += [(h, "likely", seed) for h in _HIDDEN]
-        rows += [("7", m, seed) for m in _METHODS]
+    rows = [(h, "likely", seed) for seed in range(3) for h in _HIDDEN]
+    rows += [("7", m, seed) for seed in range(3) for m in _METHODS]
     rows += [(h, "rigid", 0) for h in ("0", "3", "7", "0.3", "0.5", "self")]
+    rows.sort(key=lambda row: row[0] in _BETWEEN)  # the levels between the others come last
     return [{"data": "martial", "hidden": h, "method": m, "seed": s} for h, m, s in rows]
 
 
