@@ -19,7 +19,7 @@ def cases(quick):
         return [{"data": "motion-small", "hidden": "7", "method": m, "seed": 0} for m in methods]
     rows = [(h, "likely", seed) for seed in range(3) for h in _HIDDEN]
     rows += [("7", m, seed) for seed in range(3) for m in _METHODS]
-    rows += [(h, "rigid", 0) for h in ("0", "3", "7", "0.3", "0.5", "self")]
+    rows += [(h, "rigid", 0) for h in _HIDDEN]
     rows.sort(key=lambda row: row[0] in _BETWEEN)  # the levels between the others come last
     return [{"data": "martial", "hidden": h, "method": m, "seed": s} for h, m, s in rows]
 
