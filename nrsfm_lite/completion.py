@@ -19,7 +19,7 @@ _ITERATIONS = 30
 _FRAMES = 4000  # at most, drawn evenly
 _SHIFT = 1.0  # variance of t, in the network's units: anything a centred frame can need
 _NOISE = 1e-4  # variance of visible points, relative to the same; keeps matrices away from singular
-_DOUBT = 1e-2  # variance of a point of confidence ω is this times 1/ω − 1
+_DOUBT = 1e-2  # variance of a point of confidence ω, relative to the frame's highest, is this times 1/ω − 1
 _CHUNK = 64
 
 
@@ -36,7 +36,7 @@ def learn(X, visible):
     G : (P, P) tensor in double precision; its rows sum to zero, as the centroid belongs to t.
     """
     step = -(-len(X) // _FRAMES)
-    X, weight = X[::step].double(), visible[::step].double()
+    X, weight = X[::step].double(), _relative(visible[::step].double())
     F, P, _ = X.shape
     if (weight == 1).all():
         X = X - X.mean(1, keepdim=True)
@@ -73,7 +73,7 @@ def fill(G, X, visible):
     P = X.shape[1]
     filled = []
     for x, weight in [(X, visible)] if torch.compiler.is_exporting() else _parts(X, visible):
-        x, weight = x.to(G), weight.to(G)
+        x, weight = x.to(G), _relative(weight.to(G))
         share, noise = _trust(weight)
         mean = torch.zeros_like(x)
         Sigma = (G + _SHIFT).expand(x.shape[0], P, P)  # not len(x), which `torch.export` would fix
@@ -120,6 +120,11 @@ def complete(W, visible=None):
 def _parts(X, visible):
     """A few frames at a time, so that their matrices stay in the cache."""
     return zip(X.split(_CHUNK), visible.split(_CHUNK), strict=True)
+
+
+def _relative(weight):
+    """Weights relative to the frame's largest: doubt about all points alike says nothing about where one is."""
+    return weight / weight.amax(1, keepdim=True).clamp(min=1e-12)
 
 
 def _trust(weight):

@@ -26,20 +26,21 @@ def body():
     return W / preprocessing.set_scale(X, seen), X / preprocessing.set_scale(X, seen), seen
 
 
-@pytest.mark.parametrize("weight", [[1, 0, 1, 1, 0], [1, 0.5, 0, 0.1, 1]])
+@pytest.mark.parametrize("weight", [[1, 0, 1, 1, 0], [1, 0.5, 0, 0.1, 1], [0.2, 0.1, 0, 0.02, 0.2]])
 def test_a_hidden_point_is_put_at_its_conditional_mean(weight):
     rng = np.random.default_rng(0)
     B = rng.normal(size=(5, 5))
     C = np.eye(5) - 1 / 5
     G = C @ B @ B.T @ C
-    x, w = rng.normal(size=(1, 5, 2)), np.array(weight, float)
+    x, given = rng.normal(size=(1, 5, 2)), np.array(weight, float)
+    w = given / given.max()
     seen = w > 0
     noise = 1e-4 + 1e-2 * (1 / w[seen] - 1)
     Sigma = G + 1
     likely = Sigma[:, seen] @ np.linalg.solve(Sigma[np.ix_(seen, seen)] + np.diag(noise), x[0, seen])
     expected = np.where((w == 1)[:, None], x[0], likely)
     expected -= expected.mean(0)
-    filled = completion.fill(torch.as_tensor(G), torch.as_tensor(x), torch.as_tensor(w)[None])
+    filled = completion.fill(torch.as_tensor(G), torch.as_tensor(x), torch.as_tensor(given)[None])
     np.testing.assert_allclose(filled[0], expected, atol=1e-10)
 
 

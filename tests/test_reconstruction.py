@@ -151,6 +151,8 @@ def test_a_wrong_point_without_confidence_does_not_matter(views, rec):
     hidden = nl.reconstruct(W, model=rec.model, confidence=confidence)
     errors = [nl.metrics.normalized_error(r.shapes, views.points3d).mean() for r in (trusted, doubted, hidden, rec)]
     assert errors[0] > 2 * errors[1] and errors[1] < 1.3 * errors[3] and errors[2] < 1.3 * errors[3]
+    alike = nl.reconstruct(views, model=rec.model, confidence=np.full((600, 31), 0.01), refine=False)
+    np.testing.assert_allclose(alike.shapes, nl.reconstruct(views, model=rec.model, refine=False).shapes, atol=1e-6)
     same = nl.reconstruct(views, visible=confidence > 0, model=rec.model)
     np.testing.assert_allclose(same.shapes, hidden.shapes, atol=1e-9)
 
