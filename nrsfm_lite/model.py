@@ -16,7 +16,7 @@ from .cameras import nearest_orthonormal
 from .shape_prior import KINDS, Gaussian
 from .sparse_coding import mutual_coherence
 
-EPSILON = 0.05  # ε of the 4×2 model: the length of the row of translations in D₁
+EPSILON = 0.05  # ε of the 4×2 model: every entry of the row of translations in D₁, up to its sign
 
 
 @dataclass(frozen=True)
