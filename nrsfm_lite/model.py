@@ -222,6 +222,15 @@ class DeepNRSfM(nn.Module):
         S = psi @ self.D[0].flatten(1)  # (B, 3P)
         return S.view(-1, *self.output_bias.shape) + self.output_bias
 
+    def scaled(self, W, visible):
+        """Points in the network's unit: X (B, P, 2) as in `normalize`; the mean (B, 2) and the scale (B,) taken out."""
+        X, mean = preprocessing.center(W, visible)
+        if self.config.projection == "orthographic":
+            scale = self.scale.expand(X.shape[0])  # not len(X), which `torch.export` would fix
+        else:
+            scale = preprocessing.frame_scale(X, visible)
+        return X / scale[:, None, None], mean, scale
+
     def normalize(self, W, visible):
         """From image coordinates to the network's.
 
@@ -233,12 +242,7 @@ class DeepNRSfM(nn.Module):
             Points centred over the visible ones, zero where hidden: what the loss and the prior compare with.
         scale : (B,)
         """
-        X, mean = preprocessing.center(W, visible)
-        if self.config.projection == "orthographic":
-            scale = self.scale.expand(X.shape[0])  # not len(X), which `torch.export` would fix
-        else:
-            scale = preprocessing.frame_scale(X, visible)
-        X = X / scale[:, None, None]
+        X, mean, scale = self.scaled(W, visible)
         if not torch.compiler.is_exporting() and (visible == 1).all():
             image = X  # the shortcut is the same, but an exported graph has no branches
         elif self.config.fill == "likely":

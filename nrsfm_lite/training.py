@@ -152,7 +152,7 @@ def fit(
     net.scale.fill_(preprocessing.set_scale(X, weight))
     net.origin.copy_(mean.mean(0))
     with use_threads(threads):
-        net.image_covariance.copy_(completion.learn(X / net.scale, weight))
+        net.image_covariance.copy_(completion.learn(net.scaled(W, weight)[0], weight))
         image, X, _ = net.normalize(W, weight)
     size = preprocessing.frame_size(X, weight).float().to(device)
     complete = bool((weight == 1).all())
