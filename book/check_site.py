@@ -64,7 +64,10 @@ def test_page(browser, address, name, theme, width):
         turn(page, figure)
     SHOTS.mkdir(parents=True, exist_ok=True)
     page.evaluate("scrollTo(0, 0)")
-    page.screenshot(path=SHOTS / f"{Path(name).stem}-{theme}-{width}.png", full_page=True)
+    height = page.evaluate("document.documentElement.scrollHeight")
+    for part, top in enumerate(range(0, height, 8000)):  # Chromium repeats itself in pictures taller than 8192 pixels
+        clip = {"x": 0, "y": top, "width": width, "height": min(8000, height - top)}
+        page.screenshot(path=SHOTS / f"{Path(name).stem}-{theme}-{width}-{part}.png", full_page=True, clip=clip)
     if width < 600:
         page.click(".primary-toggle:visible")
         page.wait_for_selector("nav.bd-links:visible")  # the menu opens
