@@ -46,6 +46,14 @@ def project(S, M, t=None):
     return W if t is None else W + t[..., None, :]
 
 
+def nearness(S, M):
+    """How far each point is from the plane through the origin towards the viewer; x right, y up, z to the viewer.
+
+    Arrays S (F, P, 3) and M (F, 3, 2); returns (F, P).
+    """
+    return np.einsum("fpi,fi->fp", S, np.cross(M[:, :, 0], M[:, :, 1]))
+
+
 def nearest_orthonormal(A):
     """The camera nearest to each 3×2 matrix: its polar factor A (AᵀA)^(-1/2) = U Vᵀ, in closed form.
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..cameras import project, random_cameras
+from ..cameras import nearness, project, random_cameras
 from ..data import Landmarks
 
 
@@ -87,7 +87,7 @@ def make_views(
     W = project(S, cameras)
     if projection == "perspective":
         far = distance * size
-        W = W * (far / (far - _nearness(S, cameras)))[..., None]
+        W = W * (far / (far - nearness(S, cameras)))[..., None]
     perturbation = noise_rng.standard_normal(W.shape)
     perturbation *= (
         noise * np.linalg.norm(W, axis=(1, 2), keepdims=True) / np.linalg.norm(perturbation, axis=(1, 2), keepdims=True)
@@ -102,14 +102,9 @@ def make_views(
     )
 
 
-def _nearness(S, cameras):
-    """(F, P): how far each point is from the centroid's plane towards the viewer. x right, y up, z to the viewer."""
-    return np.einsum("fpi,fi->fp", S, np.cross(cameras[:, :, 0], cameras[:, :, 1]))
-
-
 def _in_sight(S, cameras, edges, radius):
     """(F, P) bool: False where a rod of this radius around some edge is in front of a point."""
-    Q = np.concatenate([project(S, cameras), _nearness(S, cameras)[..., None]], 2)  # x, y, nearness
+    Q = np.concatenate([project(S, cameras), nearness(S, cameras)[..., None]], 2)  # x, y, nearness
     visible = np.ones(S.shape[:2], bool)
     for a, b in edges:
         start, along = Q[:, None, a], (Q[:, b] - Q[:, a])[:, None]  # (F, 1, 3)

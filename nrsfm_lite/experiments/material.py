@@ -147,13 +147,15 @@ def score_variant(data, seed, **setting):
 
 def compare_variants(setting, rows):
     """Mean and spread over seeds of the errors, for each data set and value of the setting, as text."""
-    lines = []
-    groups = dict.fromkeys((r["data"], r[setting]) for r in rows)
-    for data, value in groups:
-        chosen = [r for r in rows if (r["data"], r[setting]) == (data, value)]
-        words = mean_and_spread(chosen, ("image_error", "by_code", "by_code_unseen"))
-        lines.append(f"{data}, {setting} {value}, {len(chosen)} seeds: {words}")
-    return "\n".join(lines)
+    return by_groups(("data", setting), ("image_error", "by_code", "by_code_unseen"), rows)
+
+
+def by_groups(keys, columns, rows):
+    """Mean ± standard deviation of some columns over the rows that agree in `keys`, a line for each group."""
+    groups = {}
+    for row in rows:
+        groups.setdefault(tuple(f"{key} {row[key]}" for key in keys), []).append(row)
+    return "\n".join(f"{', '.join(g)}, {len(r)} seeds: {mean_and_spread(r, columns)}" for g, r in groups.items())
 
 
 def mean_and_spread(rows, keys):

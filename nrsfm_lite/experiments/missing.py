@@ -1,9 +1,9 @@
 """Missing points: how much of the shape is left when 1 to 7 of 31 points, a third, or half are hidden (chapter 11)."""
 
-import numpy as np
-
 from .. import baselines
 from ..data import Landmarks
+from ..reconstruction import reconstruct
+from ..training import fit
 from . import material
 
 QUESTION = "How does the error grow with the number of hidden points, and what should the encoder see in their place?"
@@ -47,22 +47,17 @@ def measure(data, hidden, method, seed):
     result = {k: "" for key in keys for k in (key, f"{key}_hidden")} | {"shift": ""}
     if method == "rigid":
         return result | material.hidden_errors("seen", baselines.tomasi_kanade(train).shapes, train)
-    net = material.fit(_complete(train), steps=material.quick_steps(data), seed=seed, progress=False)
+    net = fit(_complete(train), steps=material.quick_steps(data), seed=seed, progress=False)
     for key, frames in (("refined", train), ("refined_unseen", test)):
-        S = material.reconstruct(_complete(frames), model=net).shapes
+        S = reconstruct(_complete(frames), model=net).shapes
         result |= material.hidden_errors(key, S, frames)
     return result
 
 
 def report(rows):
     """Mean and spread over seeds, a line per number of hidden points and method."""
-    lines = []
-    for hidden, method in dict.fromkeys((r["hidden"], r["method"]) for r in rows):
-        chosen = [r for r in rows if (r["hidden"], r["method"]) == (hidden, method)]
-        words = material.mean_and_spread(chosen, ("seen", "refined", "refined_hidden", "refined_unseen"))
-        lines.append(f"{hidden} hidden, {method}, {len(chosen)} seeds: {words}")
-    return "\n".join(lines)
+    return material.by_groups(("hidden", "method"), ("seen", "refined", "refined_hidden", "refined_unseen"), rows)
 
 
 def _complete(frames):
-    return Landmarks(np.asarray(baselines.complete(frames)))
+    return Landmarks(baselines.complete(frames))

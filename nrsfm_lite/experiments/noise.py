@@ -42,13 +42,9 @@ def measure(data, noise, method, seed):
 
 def report(rows):
     """Mean and spread over seeds, a line per level and method."""
-    lines = []
-    for noise, method in dict.fromkeys((r["noise"], r["method"]) for r in rows):
-        chosen = [r for r in rows if (r["noise"], r["method"]) == (noise, method)]
-        keys = ("seen", "refined", "refined_unseen", "first_threshold", "active", "found_noise")
-        words = material.mean_and_spread(chosen, keys if method == "network" else keys[:1])
-        lines.append(f"noise {noise}, {method}, {len(chosen)} seeds: {words}")
-    return "\n".join(lines)
+    return material.by_groups(
+        ("noise", "method"), ("seen", "refined", "refined_unseen", "first_threshold", "active", "found_noise"), rows
+    )
 
 
 @torch.no_grad()

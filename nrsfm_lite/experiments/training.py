@@ -50,9 +50,6 @@ def measure(schedule, data, seed):
 
 def report(rows):
     """Mean and spread over seeds, a line per schedule and data set."""
-    lines = []
-    for schedule, data in dict.fromkeys((r["schedule"], r["data"]) for r in rows):
-        chosen = [r for r in rows if (r["schedule"], r["data"]) == (schedule, data)]
-        words = material.mean_and_spread(chosen, ("train_seconds", "seen", "refined", "unseen", "refined_unseen"))
-        lines.append(f"{schedule:8s} {data:7s} {len(chosen)} seeds: {words}")
-    return "\n".join(lines)
+    return material.by_groups(
+        ("schedule", "data"), ("train_seconds", "seen", "refined", "unseen", "refined_unseen"), rows
+    )

@@ -40,9 +40,4 @@ def measure(data, model, hidden, translation, seed):
 
 def report(rows):
     """Mean and spread over seeds, a line per model and kind of images."""
-    lines = []
-    for case in dict.fromkeys((r["model"], r["hidden"], r["translation"]) for r in rows):
-        chosen = [r for r in rows if (r["model"], r["hidden"], r["translation"]) == case]
-        words = material.mean_and_spread(chosen, ("seen", "refined", "refined_unseen", "shift"))
-        lines.append(f"{case[0]}, {case[1]} hidden, translations to {case[2]}, {len(chosen)} seeds: {words}")
-    return "\n".join(lines)
+    return material.by_groups(("model", "hidden", "translation"), ("seen", "refined", "refined_unseen", "shift"), rows)

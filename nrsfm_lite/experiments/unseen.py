@@ -2,11 +2,10 @@
 
 import math
 
-import numpy as np
 import torch
 
 from .. import metrics, shape_prior
-from ..cameras import image_turns, nearest_orthonormal, random_cameras
+from ..cameras import image_turns, nearest_orthonormal, nearness, random_cameras
 from ..model import Config, DeepNRSfM
 from ..preprocessing import set_scale
 from ..threads import use_threads
@@ -38,7 +37,7 @@ def conditions(quick):
         "schedule": "the default; with 3D supervision without its pull",
         "errors": "mean normalised 3D error; seen, unseen: one pass; refined: with a shape prior learned as in `fit`",
         _DEPTH: "the loss takes the depth of every point, beside its image, from the truth; shown for comparison only",
-        "new views": "half of each batch: the network's own shapes from new cameras, asked for the same shapes",
+        "new views": "a second term, halved: the network's own shapes from new cameras, asked for the same shapes",
         "unit dictionaries": "spectral norm 1 in the encoder; two or three iterations of block ISTA also have it",
     }
 
@@ -55,12 +54,7 @@ def measure(data, change, seed):
 
 def report(rows):
     """Mean and spread over seeds, a line per data set and change."""
-    lines = []
-    for data, change in dict.fromkeys((r["data"], r["change"]) for r in rows):
-        chosen = [r for r in rows if (r["data"], r["change"]) == (data, change)]
-        words = material.mean_and_spread(chosen, ("seen", "unseen", "refined", "refined_unseen"))
-        lines.append(f"{data}, {change}, {len(chosen)} seeds: {words}")
-    return "\n".join(lines)
+    return material.by_groups(("data", "change"), ("seen", "unseen", "refined", "refined_unseen"), rows)
 
 
 def _train(views, change, steps, seed):
@@ -72,7 +66,7 @@ def _train(views, change, steps, seed):
     visible = torch.ones(W.shape[:2], dtype=torch.bool)
     net.scale.fill_(set_scale(W - W.mean(1, keepdim=True), visible))
     X = net.normalize(W, visible)[1].float()
-    depth = torch.as_tensor(_depths(views)).float() / net.scale
+    depth = torch.as_tensor(nearness(views.points3d, views.cameras)).float() / net.scale
     optimizers = make_optimizers(net, plan)
     rates = [torch.optim.lr_scheduler.LambdaLR(o, warmup_cosine(steps)) for o in optimizers]
     for step in range(steps):
@@ -173,10 +167,3 @@ def _guess(nets, change, views):
 
 def _error(S, views):
     return float(metrics.normalized_error(S, views.points3d).mean())
-
-
-def _depths(views):
-    """(F, P): how far each true point is behind the image."""
-    third = np.cross(views.cameras[:, :, 0], views.cameras[:, :, 1])
-    S = views.points3d - views.points3d.mean(1, keepdims=True)
-    return np.einsum("fpi,fi->fp", S, third)
