@@ -51,7 +51,21 @@ def nearness(S, M):
 
     Arrays S (F, P, 3) and M (F, 3, 2); returns (F, P).
     """
-    return np.einsum("fpi,fi->fp", S, np.cross(M[:, :, 0], M[:, :, 1]))
+    return camera_frame(S, M)[:, :, 2]
+
+
+def camera_frame(S, M):
+    """Shapes as their cameras see them: x right, y up, z towards the viewer.
+
+    Methods that find no camera return their shapes like this, so a comparison turns all others and the truth.
+    Arrays S (F, P, 3) and M (F, 3, 2); returns (F, P, 3).
+    """
+    return S @ rotations(M)
+
+
+def rotations(M):
+    """Cameras (F, 3, 2) completed by the direction to the viewer, m₁ × m₂: array (F, 3, 3)."""
+    return np.concatenate([M, np.cross(M[..., 0], M[..., 1])[..., None]], -1)
 
 
 def nearest_orthonormal(A):
@@ -147,11 +161,6 @@ def rotation_error(M, M_true, degrees=True):
     if M.shape != M_true.shape or M.shape[1:] != (3, 2):
         raise ValueError(f"M and M_true have shapes {M.shape} and {M_true.shape}; expected (F, 3, 2) twice.")
     U, _, Vh = np.linalg.svd(np.einsum("fij,fkj->ik", M_true, M))
-    aligned = (U @ Vh) @ M
-
-    def complete(C):
-        return np.concatenate([C, np.cross(C[..., 0], C[..., 1])[..., None]], -1)
-
-    relative = complete(aligned).swapaxes(1, 2) @ complete(M_true)
+    relative = rotations((U @ Vh) @ M).swapaxes(1, 2) @ rotations(M_true)
     angle = Rotation.from_matrix(relative).magnitude()
     return np.degrees(angle) if degrees else angle

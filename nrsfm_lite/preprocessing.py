@@ -53,7 +53,7 @@ def check_points(visible, names=()):
     hidden = (visible == 0).all(0)
     if hidden.any():
         point = int(hidden.nonzero()[0])
-        raise ValueError(f"point {names[point] if names else point} is hidden in every frame of W; leave it out.")
+        raise ValueError(f"{names[point] if names else f'point {point}'} is hidden in every frame of W; leave it out.")
 
 
 def check_extent(W, visible):

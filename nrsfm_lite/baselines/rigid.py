@@ -4,8 +4,7 @@ import numpy as np
 import torch
 
 from ..cameras import nearest_orthonormal
-from ..completion import complete
-from ..data import Reconstruction, as_points
+from .images import read
 
 
 def tomasi_kanade(W, visible=None):
@@ -32,24 +31,16 @@ def tomasi_kanade(W, visible=None):
         With fewer than 3 frames or 4 points, a point hidden in every frame, or if all points lie in one
         plane or the views are all alike (rank below 3).
     """
-    W, visible, names, edges = as_points(W, visible)
-    F, P, _ = W.shape
-    if F < 3 or P < 4:
-        raise ValueError(f"tomasi_kanade needs at least 3 frames and 4 points; got {F} and {P}.")
-    W = complete(W, visible)
-    t = W.mean(1)
-    X = (W - t[:, None]).transpose(0, 2, 1).reshape(2 * F, P)  # rows: x and y of each frame
-    U, s, Vh = np.linalg.svd(X, full_matrices=False)
+    images = read(W, visible, method="tomasi_kanade")
+    F = len(images.X)
+    U, s, Vh = np.linalg.svd(images.stacked(), full_matrices=False)
     if s[2] <= 1e-9 * s[0]:
         raise ValueError("W has rank below 3: the points lie in one plane, or all views are alike.")
     motion = (U[:, :3] * np.sqrt(s[:3])).reshape(F, 2, 3)
     G = _metric_upgrade(motion)
     M = nearest_orthonormal(torch.as_tensor((motion @ G).transpose(0, 2, 1).copy())).numpy()  # (F, 3, 2)
     S = (np.linalg.solve(G, np.sqrt(s[:3])[:, None] * Vh[:3])).T  # (P, 3)
-    return Reconstruction(
-        shapes=np.broadcast_to(S - S.mean(0), (F, P, 3)).copy(),
-        cameras=M, translations=t, visible=visible, names=names, edges=edges, method="tomasi_kanade",
-    )  # fmt: skip
+    return images.reconstruction(np.repeat(S[None], F, axis=0), M, "tomasi_kanade")
 
 
 def _metric_upgrade(motion):
