@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.optimize import check_grad
 
 import nrsfm_lite as nl
-from nrsfm_lite.baselines import complete, tomasi_kanade, upgrade
+from nrsfm_lite.baselines import complete, tomasi_kanade
 
 
 @pytest.fixture
@@ -74,12 +73,6 @@ def test_pta_is_exact_on_smooth_trajectories_and_fails_on_shuffled_ones(rng):
     order = rng.permutation(len(data))
     shuffled = nl.baselines.pta(data[order], rank=2)
     assert nl.metrics.normalized_error(shuffled.shapes, data.points3d[order]).mean() > 50 * error
-
-
-def test_pta_gradient(rng):
-    misfit = upgrade._misfit
-    motion, q = rng.normal(size=(20, 2, 6)), rng.normal(size=18)
-    assert check_grad(lambda q: misfit(q, motion)[0], lambda q: misfit(q, motion)[1], q) < 1e-4
 
 
 @pytest.mark.realdata

@@ -1,7 +1,10 @@
 """Classical methods, in one signature: (W or Landmarks, visible=None, **own) -> Reconstruction."""
 
 from ..completion import complete
+from .bmm import bmm
+from .ksta import ksta
 from .pta import pta
 from .rigid import tomasi_kanade
+from .riks import riks
 
-__all__ = ["complete", "pta", "tomasi_kanade"]
+__all__ = ["bmm", "complete", "ksta", "pta", "riks", "tomasi_kanade"]

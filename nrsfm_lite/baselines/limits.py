@@ -31,14 +31,14 @@ class Watch:
         return self.end is not None and time.monotonic() > self.end
 
     def steps(self, things, what):
-        """The items of `things` (or of range(things)), one by one, until they or the time are over."""
+        """The items of `things` (or of range(things)) until they or the time are over; the first one always."""
         things = range(things) if isinstance(things, int) else things
         bar = tqdm(things, desc=f"{self.method}: {what}", disable=not self.progress, leave=False)
         for thing in bar:
+            yield thing
             if self.over:
                 bar.close()
                 return
-            yield thing
 
 
 def check_cost(method, frames, gigabytes, seconds=0, max_seconds=None, advice=""):

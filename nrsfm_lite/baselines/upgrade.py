@@ -1,7 +1,10 @@
 """From factors to cameras: the Euclidean upgrade of smooth motions, and the signs of its frames."""
 
 import numpy as np
+import torch
 from scipy.optimize import minimize
+
+from ..cameras import nearest_orthonormal
 
 
 def trajectory_cameras(X):
@@ -10,7 +13,8 @@ def trajectory_cameras(X):
     The centred images stacked (2F, P) are factored by singular value decomposition. Three columns Q
     of the upgrade are found such that each frame's two rows become orthonormal: first on the 6
     strongest components, then on 3 more at a time, each from the last result, until nothing improves.
-    Deterministic; a good minimum needs cameras that move smoothly.
+    Deterministic; a good minimum needs cameras that move smoothly, and exact cameras a rigid part of the shape:
+    a combination of the coefficients that is constant over the frames.
 
     Parameters
     ----------
@@ -53,6 +57,50 @@ def _misfit(q, motion):
     return value, gradient.ravel()
 
 
+def unordered_cameras(X, rank, starts, rng):
+    """Cameras of shapes of low rank, in any order of the frames: the upgrade of the block matrix method.
+
+    As in `trajectory_cameras`, three columns G of the upgrade make each frame's two rows orthonormal, here of any
+    length: the sum over frames of (1 − ‖r₂‖²/‖r₁‖²)² + 4 (r₁·r₂/‖r₁‖²)² is minimised over 3·rank components.
+    Dai et al. (2014) start from a semidefinite programme. That start is poor (baselines are compared in chapter
+    02), and what decides is the minimum that is reached: so we start at random, several times, and keep the lowest.
+
+    Parameters
+    ----------
+    X : (F, P, 2) centred image points
+    rank : int, number of shape atoms
+    starts : iterable; one minimisation for each of its items
+    rng : NumPy Generator
+
+    Returns
+    -------
+    (F, 3, 2), orthonormal; signs as `consistent` sets them.
+    """
+    F, P, _ = X.shape
+    U, s, _ = np.linalg.svd(X.transpose(0, 2, 1).reshape(2 * F, P), full_matrices=False)
+    n = min(3 * rank, len(s))
+    motion = np.ascontiguousarray((U[:, :n] * np.sqrt(s[:n])).reshape(F, 2, n))
+    best = None
+    for _ in starts:
+        first = np.linalg.qr(rng.normal(size=(n, 3)))[0]
+        found = minimize(_ratio_misfit, first.ravel(), args=(motion,), jac=True, method="BFGS")
+        best = found if best is None or found.fun < best.fun else best
+    rows = motion @ best.x.reshape(n, 3)  # (F, 2, 3)
+    M = nearest_orthonormal(torch.as_tensor(rows.transpose(0, 2, 1).copy())).numpy()
+    return consistent(M, X)
+
+
+def _ratio_misfit(g, motion):
+    """How far the rows of motion_f @ G are from equal length and a right angle, and its gradient."""
+    flat = motion.reshape(-1, motion.shape[2])
+    r1, r2 = (flat @ g.reshape(-1, 3)).reshape(-1, 2, 3).transpose(1, 0, 2)  # (F, 3) each
+    a, b, c = ((u * v).sum(1) for u, v in ((r1, r1), (r2, r2), (r1, r2)))
+    length, angle = 1 - b / a, 2 * c / a
+    da, db, dc = (2 * length * b - 2 * angle * 2 * c) / a**2, -2 * length / a, 4 * angle / a
+    by_rows = np.stack([2 * da[:, None] * r1 + dc[:, None] * r2, 2 * db[:, None] * r2 + dc[:, None] * r1], 1)
+    return (length**2).sum() + (angle**2).sum(), (flat.T @ by_rows.reshape(-1, 3)).ravel()
+
+
 def continuous(rows):
     """Negate frames whose camera would turn by more than 90° from the frame before: (F, 2, 3)."""
     rows = rows.copy()
@@ -80,7 +128,7 @@ def consistent(M, X):
     """
     laid = (X @ M.swapaxes(1, 2)).reshape(len(X), -1)
     # Start from the main direction of all frames, whatever their signs.
-    sign = np.sign(laid @ np.linalg.svd(laid, full_matrices=False)[2][0])
+    sign = np.sign(laid @ np.linalg.eigh(laid.T @ laid)[1][:, -1])
     sign[sign == 0] = 1
     for _ in range(len(X)):
         wrong = (laid * sign[:, None]) @ (laid * sign[:, None]).mean(0) < 0

@@ -1,0 +1,127 @@
+"""Kernel shape trajectory approach: shapes along a smooth curve in few dimensions (Gotardo and Martinez, 2011)."""
+
+import numpy as np
+from scipy.fft import idct
+from scipy.spatial.distance import cdist, pdist
+
+from .images import read
+from .limits import Watch, check_cost
+from .upgrade import trajectory_cameras
+from .variable_projection import Coefficients, fit
+
+
+def ksta(W, visible=None, rank=9, smoothness=0.1, dimensions=3, max_seconds=None, progress=True):
+    """A point wanders smoothly through few dimensions, and the shape is a smooth function of where it is.
+
+    Objective: ``min Σ_f ‖X_f − Σ_k κ(y_f, b_k) B_k M_f‖²`` over atoms B_k, centres b_k and the curve y, where κ is
+    a Gaussian kernel and y_f is a sum of few cosines of time. The cameras are those of `trajectory_cameras` and
+    stay; the atoms are eliminated (`variable_projection`). The start is the same with κ(y, b_k) = y_k, the linear
+    "column space fitting" of the same authors.
+
+    With d = smoothness · F cosines and q dimensions, cost O(F d² q² + F d q · rank · P) for a step, up to 100
+    steps for each of the two stages; memory O(F · rank² · P + (dq)²). Their published form holds a Jacobian of
+    2FP × dq numbers; ours does not, but d grows with F, so time grows with F³.
+
+    Assumes orthographic views in *temporal order* from a slowly moving camera.
+
+    Parameters
+    ----------
+    W : Landmarks, or (F, P, 2) array of image points, in temporal order
+    visible : (F, P) bool, optional
+        Hidden points are filled in by `complete` first.
+    rank : int
+        Number of atoms and centres K; 3K at most P and 2F.
+    smoothness : float
+        Number of cosines over the number of frames: .1 for slow, .3 for fast motion; at least `rank` are taken.
+    dimensions : int
+        Of the curve, q, less than `rank`: 2 or 3.
+    max_seconds : float, optional
+        Then the result so far is returned, with ``converged=False``.
+    progress : bool
+
+    Returns
+    -------
+    Reconstruction in one world frame for all frames.
+
+    Raises
+    ------
+    ValueError
+        As `images.read`; for a parameter out of range; or if memory or time would not suffice.
+
+    Notes
+    -----
+    Certain, from the abstract and from the authors' code of the linear method: the kernel, the smooth curve, the
+    eliminated atoms, the cameras. Reconstructed by us, as neither code nor full text could be had: the kernel's
+    width (the median squared distance of the starting curve), the centres' start (farthest points of the curve)
+    and the starting curve (the first coefficients of the linear method). Rank, smoothness and dimensions per
+    sequence are not known to us either.
+    """
+    images = read(W, visible, frames=6, points=6, method="ksta")
+    F, P, _ = images.X.shape
+    most = min(P, 2 * F) // 3
+    if not 1 < rank <= most:
+        raise ValueError(f"rank={rank}; expected 2 … {most} for {F} frames and {P} points.")
+    if not 1 <= dimensions < rank:
+        raise ValueError(f"dimensions={dimensions}; expected 1 … {rank - 1}, less than the rank.")
+    if not 0 < smoothness <= 1:
+        raise ValueError(f"smoothness={smoothness}; expected a share of the frames, above 0 and at most 1.")
+    d = max(rank, round(smoothness * F))
+    check_cost("ksta", F, *_cost(F, P, d, rank), max_seconds, "A smaller smoothness takes fewer cosines.")
+    watch = Watch("ksta", max_seconds, progress)
+    M = trajectory_cameras(images.X)
+    cosines = idct(np.eye(F, d), axis=0, norm="ortho")
+    S, linear, done = _linear(images.X, M, cosines, rank, watch)
+    if not watch.over:
+        S, done = _curved(images.X, M, cosines, linear[:, :dimensions], rank, watch)
+    return images.reconstruction(S, M, "ksta", done)
+
+
+def _linear(X, M, cosines, rank, watch):
+    """Column space fitting: C = Ω Z. Returns shapes, C, and whether it converged."""
+    F, d = cosines.shape
+    local, free = np.broadcast_to(np.eye(rank), (F, rank, rank)), np.zeros((F, rank, 0))
+
+    def coefficients(theta):
+        return Coefficients(cosines @ theta.reshape(d, rank), cosines, local, free)
+
+    def orthonormal(theta):  # the atoms undo any change of basis
+        return np.linalg.qr(theta.reshape(d, rank))[0].ravel()
+
+    S, theta, done = fit(X, M, coefficients, np.eye(d, rank).ravel(), watch, tidy=orthonormal)
+    return S, coefficients(theta).C, done
+
+
+def _curved(X, M, cosines, y, rank, watch):
+    """C = κ(Ω Z, b), from a starting curve y (F, q). Returns shapes and whether it converged."""
+    (F, d), q = cosines.shape, y.shape[1]
+    y = y / y.std(0)
+    width = np.median(pdist(y, "sqeuclidean"))
+    split = d * q
+
+    def coefficients(theta):
+        y, b = cosines @ theta[:split].reshape(d, q), theta[split:].reshape(rank, q)
+        C = np.exp(-cdist(y, b, "sqeuclidean") / (2 * width))
+        local = (b - y[:, None]) * C[..., None] / width  # (F, K, q)
+        free = np.einsum("fkq,kl->fklq", -local, np.eye(rank)).reshape(F, rank, rank * q)
+        return Coefficients(C, cosines, local, free)
+
+    start = np.concatenate([(cosines.T @ y).ravel(), _spread_out(y, rank).ravel()])
+    S, _, done = fit(X, M, coefficients, start, watch)
+    return S, done
+
+
+def _spread_out(y, n):
+    """n rows of y, each the farthest from those before it; the first is the farthest from the mean."""
+    chosen, distance = [], np.linalg.norm(y - y.mean(0), axis=1)
+    for _ in range(n):
+        chosen.append(int(distance.argmax()))
+        to_last = np.linalg.norm(y - y[chosen[-1]], axis=1)
+        distance = to_last if len(chosen) == 1 else np.minimum(distance, to_last)
+    return y[chosen]
+
+
+def _cost(F, P, d, rank):
+    """Gigabytes and seconds, roughly."""
+    n = d * rank
+    gigabytes = 8 * (6 * F * rank**2 * P + 3 * n**2 + F * rank**2 * d) / 2**30
+    return gigabytes, 100 * (2 * F * n**2 + n**3 + 12 * F * rank * n * P) / 1e10

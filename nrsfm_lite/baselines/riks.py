@@ -1,0 +1,131 @@
+"""Rotation invariant kernels: frames that look alike have alike shapes (Hamsici, Gotardo and Martinez, 2012)."""
+
+import numpy as np
+import torch
+
+from ..threads import use_threads
+from .images import read
+from .limits import Watch, check_cost
+from .upgrade import trajectory_cameras
+from .variable_projection import Coefficients, fit
+
+KERNELS = ("asfm", "rik")
+_ENERGY = 0.99  # of the kernel's spectrum, that the basis keeps
+
+
+def riks(W, visible=None, rank=7, basis=0.2, kernel="asfm", max_seconds=None, progress=True):
+    """As column space fitting, but coefficients are smooth over *likeness of images* instead of time.
+
+    Objective: ``min Σ_f ‖X_f − Σ_k c_fk B_k M_f‖²`` with C = Φ Z, where Φ (F, d) are the main components of a
+    kernel between the images, exp(−E / 2σ²). E compares two images up to a rotation: ``"rik"`` in the plane,
+    2 − 2 |z_fᴴ z_g| for images as unit vectors of complex numbers; ``"asfm"`` in space, the energy of the two
+    images together that no rigid body can explain. σ is set so that d components hold 99 % of the spectrum.
+    The atoms follow one after the other, each from what the ones before left, which is exact only where their images
+    are independent of each other over the frames; `variable_projection` does the rest.
+
+    Cost O(F³) for each of log₂F trials of σ, then O(F d² rank² + (d · rank)³) for a step, up to 300 of them; memory
+    O(F² + (d · rank)²). With d a share of F this ends at some thousand frames.
+
+    Coefficients need no order of the frames. The cameras do: they are those of `trajectory_cameras`, as in the
+    authors' code, made for video, and they stay as they are.
+
+    Parameters
+    ----------
+    W : Landmarks, or (F, P, 2) array of image points
+    visible : (F, P) bool, optional
+        Hidden points are filled in by `complete` first.
+    rank : int
+        Number of atoms K; 3K at most P and 2F. The authors take 5 to 8, others 3 for `pickup`.
+    basis : float
+        Number of components over the number of frames: .1 to .3 in the authors' demonstration.
+    kernel : "asfm" or "rik"
+    max_seconds : float, optional
+        Then the result so far is returned, with ``converged=False``.
+    progress : bool
+
+    Returns
+    -------
+    Reconstruction in one world frame for all frames.
+
+    Raises
+    ------
+    ValueError
+        As `images.read`; for a parameter out of range; or if memory or time would not suffice.
+
+    Notes
+    -----
+    Certain: all of it, from the authors' code (their first algorithm). Their second one, which fits rank by rank
+    with weights on the points, is left out.
+    """
+    images = read(W, visible, frames=6, points=6, method="riks")
+    F, P, _ = images.X.shape
+    most = min(P, 2 * F) // 3
+    if not 1 <= rank <= most:
+        raise ValueError(f"rank={rank}; expected 1 … {most} for {F} frames and {P} points.")
+    if not 0 < basis <= 1:
+        raise ValueError(f"basis={basis}; expected a share of the frames, above 0 and at most 1.")
+    if kernel not in KERNELS:
+        raise ValueError(f"kernel={kernel!r}; expected one of {', '.join(KERNELS)}.")
+    d = max(rank, round(basis * F))
+    check_cost("riks", F, *_cost(F, P, d, rank), max_seconds, "A smaller basis takes fewer components.")
+    watch = Watch("riks", max_seconds, progress)
+    M = trajectory_cameras(images.X)
+    distances = _unlike_in_space(images.X) if kernel == "asfm" else _unlike_in_the_plane(images.X)
+    components = _components(distances, d, watch)
+    local, free = np.broadcast_to(np.eye(rank), (F, rank, rank)), np.zeros((F, rank, 0))
+
+    def coefficients(theta):
+        return Coefficients(components @ theta.reshape(d, rank), components, local, free)
+
+    start = np.eye(d, rank).ravel()
+    S, _, done = fit(images.X, M, coefficients, start, watch, sequential=True, iterations=300, tolerance=1e-9)
+    return images.reconstruction(S, M, "riks", done)
+
+
+def _unlike_in_the_plane(X):
+    """(F, F): how far two images are from a rotation of each other in the plane, 0 to 2."""
+    z = X[..., 0] + 1j * X[..., 1]
+    z = z / np.linalg.norm(z, axis=1, keepdims=True)
+    return np.maximum(2 - 2 * np.abs(z @ z.conj().T), 0)
+
+
+def _unlike_in_space(X):
+    """(F, F): the energy of two images, stacked to four rows, outside their best rank 3, which a rigid body has."""
+    F, P, _ = X.shape
+    rows = X.transpose(0, 2, 1).reshape(2 * F, P)
+    products = torch.as_tensor(rows @ rows.T).view(F, 2, F, 2).transpose(1, 2)  # (F, F, 2, 2)
+    own = products.diagonal().permute(2, 0, 1)  # (F, 2, 2), each image with itself
+    E = torch.empty(F, F, dtype=torch.float64)
+    with use_threads(1):
+        for f in range(F):  # row by row: F² matrices of 4×4 would not fit
+            mine, cross = own[f].expand(F, 2, 2), products[f]
+            gram = torch.cat([torch.cat([mine, cross], 2), torch.cat([cross.mT, own], 2)], 1)
+            E[f] = torch.linalg.eigvalsh(gram)[:, 0].clamp(min=0)
+    return ((E + E.T) / 2).numpy()
+
+
+def _components(E, d, watch):
+    """(F, d): main components of the kernel, its width chosen so that d of them hold most of the spectrum."""
+    ordered = np.sort(E, axis=1)
+    low, high = 1, len(E) - 1
+    while low < high and not watch.over:  # a wider kernel needs fewer components
+        middle = (low + high) // 2
+        spectrum = np.sort(np.abs(np.linalg.eigvalsh(_kernel(E, ordered, middle))))[::-1]
+        needed = 1 + int((np.cumsum(spectrum) < _ENERGY * spectrum.sum()).sum())
+        low, high = (middle + 1, high) if needed > d else (low, middle)
+    values, V = np.linalg.eigh(_kernel(E, ordered, low))
+    main = np.argsort(-np.abs(values))[:d]
+    # K v / sqrt(|λ|) = v · λ / sqrt(|λ|): the scale of a component is that of its singular value.
+    return V[:, main] * np.sqrt(np.abs(values[main]))
+
+
+def _kernel(E, ordered, neighbour):
+    """exp(−E / 2σ²), with σ² the mean distance to the neighbour of that rank."""
+    return np.exp(-E / (2 * max(ordered[:, neighbour].mean(), 1e-300)))
+
+
+def _cost(F, P, d, rank):
+    """Gigabytes and seconds, roughly."""
+    n = d * rank
+    gigabytes = 8 * (6 * F**2 + 6 * F * rank**2 * P + 3 * n**2) / 2**30
+    return gigabytes, (4e-11 * F**3 * np.log2(F)) + 150 * (2 * F * n**2 + n**3 + 12 * F * rank * n * P) / 1e10

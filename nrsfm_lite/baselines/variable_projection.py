@@ -1,0 +1,155 @@
+"""Low-rank shapes over given cameras, with the atoms eliminated (Gotardo and Martinez, 2011).
+
+For coefficients C (F, K) the best atoms are linear least squares. What is left is a function of C alone, and C is
+restricted to few parameters: y = Ω Z, smooth or otherwise simple functions of the frame, and C_f a function of y_f.
+Gauss–Newton with Kaufman's approximation of the Jacobian minimises it. `ksta` and `riks` differ in Ω and in that
+function only.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_RCOND = 1e-10  # kernels can make columns of C nearly dependent
+
+
+@dataclass(eq=False)
+class Coefficients:
+    """C as a function of its parameters, at one point.
+
+    Attributes
+    ----------
+    C : (F, K)
+    basis : (F, d), Ω of y = Ω Z
+    local : (F, K, q), derivative of C_f by y_f
+    free : (F, K, m), derivative of C by further parameters; m may be 0
+
+    The parameters are Z (d, q), row by row, and then the further ones.
+    """
+
+    C: np.ndarray
+    basis: np.ndarray
+    local: np.ndarray
+    free: np.ndarray
+
+    def pull(self, G):
+        """Sums over frames and atoms of dC/dθ times G (F, K, r), for all parameters: (n, r)."""
+        F, K, r = G.shape
+        inner = self.local.swapaxes(1, 2) @ G  # (F, q, r)
+        smooth = (self.basis.T @ inner.reshape(F, -1)).reshape(-1, r)
+        return np.concatenate([smooth, self.free.reshape(F * K, -1).T @ G.reshape(F * K, r)])
+
+    def gram(self, N):
+        """dC/dθᵀ N dC/dθ for a symmetric K×K matrix per frame, N (F, K, K): (n, n)."""
+        F, d = self.basis.shape
+        q, m = self.local.shape[2], self.free.shape[2]
+        both = self.local.swapaxes(1, 2) @ N @ self.local  # (F, q, q)
+        weighted = (self.basis[:, None, None] * both[..., None]).reshape(F, -1)  # (F, q·q·d)
+        smooth = (self.basis.T @ weighted).reshape(d, q, q, d).transpose(0, 1, 3, 2).reshape(d * q, d * q)
+        if not m:
+            return smooth
+        crossed = self.pull(N @ self.free)  # (n, m)
+        return np.block([[smooth, crossed[: d * q]], [crossed.T]])
+
+
+def fit(X, M, coefficients, theta, watch, *, sequential=False, tidy=None, iterations=100, tolerance=1e-6):
+    """Minimise the root mean square residual over the parameters of C, from a start.
+
+    Parameters
+    ----------
+    X : (F, P, 2) centred image points
+    M : (F, 3, 2) cameras
+    coefficients : function, theta -> Coefficients
+    theta : (n,) start
+    watch : limits.Watch
+    sequential : bool
+        Find the atoms one after the other, each from what the others left, instead of all at once.
+    tidy : function, theta -> theta, optional
+        Applied after a step; it may change the parameters in ways that do not change the residual.
+    iterations, tolerance : at most so many steps, until the root mean square changes by less
+
+    Returns
+    -------
+    S : (F, P, 3) shapes
+    theta : (n,)
+    converged : bool
+    """
+    images = X.transpose(0, 2, 1).reshape(-1, X.shape[1])  # (2F, P)
+    solve = _one_by_one if sequential else _together
+    now = coefficients(theta)
+    B, Q, P, left = solve(images, now.C, M)
+    best, damping, converged = np.sqrt((left**2).mean()), 1e-4, False
+    for _ in watch.steps(iterations, "coefficients"):
+        gradient, hessian = _normal_equations(now, M, B, Q, P, left)
+        while damping < 1e12:
+            step = np.linalg.solve(hessian + damping * np.eye(len(hessian)), gradient)
+            tried = theta + step if tidy is None else tidy(theta + step)
+            then = coefficients(tried)
+            solved = solve(images, then.C, M)
+            value = np.sqrt((solved[3] ** 2).mean())
+            if value < best or watch.over:
+                break
+            damping *= 10
+        converged = not value < best - tolerance and not watch.over
+        if value < best:
+            theta, now, best, damping = tried, then, value, damping / 100
+            B, Q, P, left = solved
+        if converged:
+            break
+    return np.einsum("fk,kip->fpi", now.C, B), theta, converged
+
+
+def _motion(C, M):
+    """(2F, K, 3): what the atoms' coordinates are multiplied by."""
+    return np.einsum("fij,fk->fjki", M, C).reshape(2 * len(M), -1, 3)
+
+
+def _together(images, C, M):
+    """Atoms B (K, 3, P) by least squares; Q and P of `_normal_equations`; the residual (2F, P)."""
+    K = C.shape[1]
+    U, s, Vh = np.linalg.svd(_motion(C, M).reshape(-1, 3 * K), full_matrices=False)
+    good = s > _RCOND * s[0]
+    U = U * good
+    seen = U.T @ images
+    B = Vh.T @ (np.where(good, 1 / np.where(good, s, 1), 0)[:, None] * seen)
+    return B.reshape(K, 3, -1), U, np.broadcast_to(U.T, (K, *U.T.shape)), images - U @ seen
+
+
+def _one_by_one(images, C, M):
+    """As `_together`, each atom from what the ones before it left."""
+    motion, left = _motion(C, M), images
+    K = C.shape[1]
+    B, Q = np.empty((K, 3, images.shape[1])), np.empty((K, len(images), 3))
+    for k in range(K):
+        Q[k], R = np.linalg.qr(motion[:, k])
+        seen = Q[k].T @ left
+        B[k] = np.linalg.lstsq(R, seen, rcond=_RCOND)[0]
+        left = left - Q[k] @ seen
+    # The residual after atom k … K−1 is (I − Q P_k) of the one before, where Q has all columns side by side.
+    flat = Q.transpose(1, 0, 2).reshape(-1, 3 * K)
+    P = np.zeros((K + 1, 3 * K, len(images)))
+    for k in reversed(range(K)):
+        own = np.eye(3 * K)[:, 3 * k : 3 * k + 3]
+        P[k] = P[k + 1] + (own - P[k + 1] @ Q[k]) @ Q[k].T
+    return B, flat, P[:K], left
+
+
+def _normal_equations(now, M, B, Q, P, left):
+    """Gradient (n,) and Gauss–Newton matrix (n, n) of half the mean square residual, in the direction of descent.
+
+    Atom k's share of the residual's derivative is (I − Q P_k) v, with v the images of B_k under dC.
+    """
+    F, K = now.C.shape
+    images = np.einsum("fij,kip->fkjp", M, B)  # (F, K, 2, P)
+    left = left.reshape(F, 1, 2, -1)
+    inner = np.einsum("fkjp,fljp->fkl", images, images, optimize=True)
+    columns = Q.shape[1]
+    by_P = np.einsum("kmfj,fkjp->fkmp", P.reshape(K, columns, F, 2), images, optimize=True).reshape(F, K, -1)
+    by_Q = np.einsum("fjm,fkjp->fkmp", Q.reshape(F, 2, columns), images, optimize=True).reshape(F, K, -1)
+    T, V = now.pull(by_P), now.pull(by_Q)  # (n, 3K·P)
+    overlap = (Q.T @ Q) @ T.reshape(len(T), columns, -1)
+    cross = V @ T.T
+    hessian = now.gram(inner) - cross - cross.T + T @ overlap.reshape(T.shape).T
+    seen = np.einsum("fjm,fjp->mp", Q.reshape(F, 2, columns), left[:, 0]).reshape(-1, 1)
+    gradient = now.pull((images * left).sum((2, 3))[..., None]) - T @ seen
+    return gradient[:, 0] / left.size, hessian / left.size
