@@ -6,5 +6,6 @@ from .ksta import ksta
 from .pta import pta
 from .rigid import tomasi_kanade
 from .riks import riks
+from .sps import sps
 
-__all__ = ["bmm", "complete", "ksta", "pta", "riks", "tomasi_kanade"]
+__all__ = ["bmm", "complete", "ksta", "pta", "riks", "sps", "tomasi_kanade"]
