@@ -12,8 +12,9 @@ def tomasi_kanade(W, visible=None):
 
     The nearest rank-3 matrix to all frames stacked, by singular value decomposition, then the metric
     upgrade that makes the cameras' columns orthonormal in the least-squares sense (linear in the Gram
-    matrix Q of the upgrade), then each camera made orthonormal on its own. Exact on rigid data without
-    noise; else a good start, not the minimum of the reprojection error. Cost O(F P²).
+    matrix Q of the upgrade), then each camera made orthonormal on its own, and the shape by least squares for
+    these cameras. Exact on rigid data without noise; else a good start, not the minimum of the reprojection
+    error. Cost O(F P²).
 
     Parameters
     ----------
@@ -33,13 +34,15 @@ def tomasi_kanade(W, visible=None):
     """
     images = read(W, visible, method="tomasi_kanade")
     F = len(images.X)
-    U, s, Vh = np.linalg.svd(images.stacked(), full_matrices=False)
+    U, s, _ = np.linalg.svd(images.stacked(), full_matrices=False)
     if s[2] <= 1e-9 * s[0]:
         raise ValueError("W has rank below 3: the points lie in one plane, or all views are alike.")
     motion = (U[:, :3] * np.sqrt(s[:3])).reshape(F, 2, 3)
     G = _metric_upgrade(motion)
     M = nearest_orthonormal(torch.as_tensor((motion @ G).transpose(0, 2, 1).copy())).numpy()  # (F, 3, 2)
-    S = (np.linalg.solve(G, np.sqrt(s[:3])[:, None] * Vh[:3])).T  # (P, 3)
+    # Not G⁻¹ times the other factor: where Q is nearly singular, as on much that is not rigid, that has no bound.
+    planes, laid = np.einsum("fij,fkj->ik", M, M), np.einsum("fpj,fij->ip", images.X, M)
+    S = np.linalg.solve(planes, laid).T  # (P, 3)
     return images.reconstruction(np.repeat(S[None], F, axis=0), M, "tomasi_kanade")
 
 
