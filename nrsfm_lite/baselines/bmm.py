@@ -63,7 +63,7 @@ def bmm(W, visible=None, rank=None, restarts=10, max_seconds=None, progress=True
         raise ValueError(f"rank={rank}; expected 2 … {most} for {F} frames and {P} points.")
     if restarts < 1:
         raise ValueError(f"restarts={restarts}; expected at least 1.")
-    check_cost("bmm", F, 80 * F * P * 8 / 2**30, 2e-7 * F * P**2 + 1e-4 * restarts * F * P, max_seconds)
+    check_cost("bmm", F, 80 * F * P * 8 / 2**30, 3.5e-6 * F * P**2, max_seconds)
     watch = Watch("bmm", max_seconds, progress)
     rng = np.random.default_rng(seed)
     M = unordered_cameras(images.X, rank, watch.steps(restarts, "cameras"), rng)

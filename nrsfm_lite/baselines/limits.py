@@ -6,7 +6,7 @@ import psutil
 from tqdm.auto import tqdm
 
 _SHARE = 0.8  # of the free memory that a method may take
-_LONG = 3600  # seconds that nobody is made to wait unasked
+LONG = 3600  # seconds that nobody is made to wait unasked
 
 
 class Watch:
@@ -63,8 +63,8 @@ def check_cost(method, frames, gigabytes, seconds=0, max_seconds=None, advice=""
             f"{method} would need about {gigabytes:.1f} GB of memory for {frames} frames, and {free:.1f} GB are free."
             f" {advice}".rstrip()
         )
-    if max_seconds is None and seconds > _LONG:
+    if max_seconds is None and seconds > LONG:
         raise ValueError(
-            f"{method} would take about {seconds / 3600:.1f} hours for {frames} frames; give max_seconds to have the "
-            f"best result of that time. {advice}".rstrip()
+            f"{method} would take up to about {seconds / 3600:.1f} hours for {frames} frames; give max_seconds to have "
+            f"the best result of that time. {advice}".rstrip()
         )
