@@ -32,9 +32,7 @@ def align(S, S_true, *, scale=True, reflections=True):
     ValueError
         If the shapes differ or a value is not finite, or if a true shape has all points equal.
     """
-    S, S_true = _pair(S, S_true)
-    S = S - S.mean(1, keepdims=True)
-    S_true = S_true - S_true.mean(1, keepdims=True)
+    S, S_true = _centred(*_pair(S, S_true))
     if scale:
         size = np.linalg.norm(S, axis=(1, 2))
         S = S * (np.linalg.norm(S_true, axis=(1, 2)) / np.where(size > 0, size, 1))[:, None, None]
@@ -70,7 +68,26 @@ def normalized_error(S, S_true, *, scale=True, reflections=True, points=None):
     return np.sqrt(square / (S_true**2).sum(2).mean(1))
 
 
-def e3d(S, S_true):
+def camera_frame_error(S, S_true):
+    """Normalised error per frame of shapes in their camera's frame, turned not at all.
+
+    Only the sign of all depths (the third coordinate) may change, per frame. For methods that return shapes in the
+    camera's frame and keep the image points as they are, this is what their authors report (Lee et al., 2016).
+
+    Parameters
+    ----------
+    S, S_true : (F, P, 3) arrays or tensors, as `cameras.camera_frame` makes them
+
+    Returns
+    -------
+    (F,) array
+    """
+    S, S_true = _centred(*_pair(S, S_true))
+    missed = [np.linalg.norm(S * (1, 1, sign) - S_true, axis=(1, 2)) for sign in (1, -1)]
+    return np.minimum(*missed) / np.linalg.norm(S_true, axis=(1, 2))
+
+
+def e3d(S, S_true, *, per_frame=False):
     """The classical normalised mean 3D error per frame, with one alignment for all frames.
 
     Both sets are centred per frame. One orthogonal matrix, the polar factor of the least-squares map
@@ -82,6 +99,8 @@ def e3d(S, S_true):
     Parameters
     ----------
     S, S_true : (F, P, 3) arrays or tensors
+    per_frame : bool
+        Align each frame on its own instead, as `align` does, without scale.
 
     Returns
     -------
@@ -92,12 +111,14 @@ def e3d(S, S_true):
     ValueError
         If the shapes differ or a value is not finite, or if a true shape has all points equal.
     """
-    S, S_true = _pair(S, S_true)
-    S, S_true = S - S.mean(1, keepdims=True), S_true - S_true.mean(1, keepdims=True)
-    linear = np.linalg.lstsq(S.reshape(-1, 3), S_true.reshape(-1, 3), rcond=None)[0]
-    U, _, Vh = np.linalg.svd(linear)
-    sigma = S_true.std(axis=1).mean()
-    return np.linalg.norm(S @ (U @ Vh) - S_true, axis=2).mean(1) / sigma
+    if per_frame:
+        moved, S_true = align(S, S_true, scale=False)
+    else:
+        S, S_true = _centred(*_pair(S, S_true))
+        linear = np.linalg.lstsq(S.reshape(-1, 3), S_true.reshape(-1, 3), rcond=None)[0]
+        U, _, Vh = np.linalg.svd(linear)
+        moved = S @ (U @ Vh)
+    return np.linalg.norm(moved - S_true, axis=2).mean(1) / S_true.std(axis=1).mean()
 
 
 def cumulative_error(errors, at=None):
@@ -129,8 +150,7 @@ def handedness(S, S_true):
     -------
     float in [0, 0.5]; 0 if all frames agree.
     """
-    S, S_true = _pair(S, S_true)
-    S, S_true = S - S.mean(1, keepdims=True), S_true - S_true.mean(1, keepdims=True)
+    S, S_true = _centred(*_pair(S, S_true))
     # det of the best orthogonal matrix has the sign of det(Sᵀ S*)
     mirrored = np.mean(np.linalg.det(S.swapaxes(1, 2) @ S_true) < 0)
     return float(min(mirrored, 1 - mirrored))
@@ -138,9 +158,8 @@ def handedness(S, S_true):
 
 def mpjpe(S, S_true):
     """Mean distance per point after centring only, in the units of the truth: (F,)."""
-    S, S_true = _pair(S, S_true)
-    difference = (S - S.mean(1, keepdims=True)) - (S_true - S_true.mean(1, keepdims=True))
-    return np.linalg.norm(difference, axis=2).mean(1)
+    S, S_true = _centred(*_pair(S, S_true))
+    return np.linalg.norm(S - S_true, axis=2).mean(1)
 
 
 def pa_mpjpe(S, S_true):
@@ -151,6 +170,10 @@ def pa_mpjpe(S, S_true):
     S, S_true = align(S, S_true, reflections=False)
     best = (S * S_true).sum((1, 2)) / np.maximum((S * S).sum((1, 2)), np.finfo(float).tiny)
     return np.linalg.norm(best[:, None, None] * S - S_true, axis=2).mean(1)
+
+
+def _centred(*shapes):
+    return [S - S.mean(1, keepdims=True) for S in shapes]
 
 
 def _pair(S, S_true):
