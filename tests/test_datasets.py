@@ -233,3 +233,25 @@ def test_npz_refuses(rng, tmp_path):
     np.savez(file, points2d=np.full((3, 4, 2), np.nan))
     with pytest.raises(ValueError, match=r"f\.npz: points2d has 12 visible points"):
         datasets.load_npz(file)
+
+
+def test_classic_sequences_come_with_their_world_or_in_the_camera_frame(tmp_path, rng):
+    S_world, R = rng.normal(size=(5, 7, 3)), nl.cameras.random_rotations(5)
+    S = S_world @ R.swapaxes(1, 2)
+    np.savez(tmp_path / "walk.npz", S=S, S_world=S_world, R=R)
+    data = nl.datasets.load_classic(tmp_path / "walk.npz")
+    np.testing.assert_allclose(data.points3d @ data.cameras, data.points2d, atol=1e-12)
+    np.testing.assert_allclose(nl.cameras.camera_frame(data.points3d, data.cameras), S - S.mean(1, keepdims=True))
+    assert data.name == "walk" and len(np.unique(data.sequence)) == 1
+    np.savez(tmp_path / "bare.npz", S=S)
+    bare = nl.datasets.load_classic(tmp_path / "bare.npz")
+    np.testing.assert_allclose(bare.points3d @ bare.cameras, bare.points2d)
+    np.savez(tmp_path / "wrong.npz", S=S, S_world=S_world, R=R[::-1])
+    with pytest.raises(ValueError, match="S is not S_world turned by R"):
+        nl.datasets.load_classic(tmp_path / "wrong.npz")
+    np.savez(tmp_path / "short.npz", S=S, S_world=S_world[:3], R=R)
+    with pytest.raises(ValueError, match="do not fit together"):
+        nl.datasets.load_classic(tmp_path / "short.npz")
+    np.savez(tmp_path / "none.npz", W=S)
+    with pytest.raises(KeyError, match="needs an array S"):
+        nl.datasets.load_classic(tmp_path / "none.npz")

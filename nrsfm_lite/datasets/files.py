@@ -1,4 +1,4 @@
-"""A user's own key points."""
+"""Files of landmarks: a user's own key points, and the classic sequences."""
 
 from pathlib import Path
 
@@ -41,3 +41,38 @@ def load_npz(path):
         return Landmarks(**chosen, name=str(arrays.get("name", path.stem)))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def load_classic(path):
+    """One of the classic sequences (drink, pickup, yoga, stretch, dance …) as an .npz of arrays.
+
+    Parameters
+    ----------
+    path : path
+        ``S`` (F, P, 3), the shapes as the camera sees them: x and y are the image. Where the shapes in the world
+        are known, ``S_world`` (F, P, 3) and rotations ``R`` (F, 3, 3) with S = S_world Rᵀ.
+
+    Returns
+    -------
+    Landmarks of one video: points3d in the world if known, else in the camera's frame; centred points2d.
+
+    Raises
+    ------
+    FileNotFoundError, KeyError, ValueError
+        As `load_npz`; also if S, S_world and R do not fit together.
+    """
+    path = Path(path)
+    arrays = read_npz(path, keys={"S", "S_world", "R"})
+    if "S" not in arrays:
+        raise KeyError(f"{path}: needs an array S (F, P, 3); it is not there.")
+    S = Landmarks(points3d=arrays["S"]).points3d
+    S = S - S.mean(1, keepdims=True)
+    if not {"S_world", "R"} <= arrays.keys():
+        return Landmarks(S[..., :2], points3d=S, cameras=np.tile(np.eye(3, 2), (len(S), 1, 1)), name=path.stem)
+    world, R = arrays["S_world"], arrays["R"]
+    if world.shape != S.shape or R.shape != (len(S), 3, 3):
+        raise ValueError(f"{path}: S {S.shape}, S_world {world.shape} and R {R.shape} do not fit together.")
+    world = world - world.mean(1, keepdims=True)
+    if not np.allclose(world @ R.swapaxes(1, 2), S, atol=1e-6 * np.abs(S).max()):
+        raise ValueError(f"{path}: S is not S_world turned by R.")
+    return Landmarks(S[..., :2], points3d=world, cameras=R.swapaxes(1, 2)[:, :, :2], name=path.stem)
