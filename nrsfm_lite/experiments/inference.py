@@ -1,8 +1,5 @@
 """How fast a trained network takes in many frames, and whether its memory stays flat."""
 
-import multiprocessing
-import resource
-import sys
 import time
 
 import numpy as np
@@ -11,6 +8,7 @@ import torch
 from ..model import DeepNRSfM
 from ..reconstruction import reconstruct
 from ..training import PRIOR_FRAMES, learn_prior
+from .process import apart, peak_mb
 
 QUESTION = "How many frames per second does `reconstruct` take in with a trained network, and how much memory?"
 _POINTS = 31
@@ -31,14 +29,7 @@ def conditions(quick):
 
 def measure(frames, refine):
     """Seconds and megabytes, measured in a process of its own, since a peak never goes down again."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    child = context.Process(target=_child, args=(theirs, frames, refine))
-    child.start()
-    theirs.close()
-    result = ours.recv()
-    child.join()
-    return result
+    return apart(_infer, frames, refine)
 
 
 def report(rows):
@@ -50,22 +41,17 @@ def report(rows):
     )
 
 
-def _child(pipe, frames, refine):
+def _infer(frames, refine):
     W = np.random.default_rng(0).normal(size=(frames, _POINTS, 2))
     net = DeepNRSfM(n_points=_POINTS).eval()
     some = torch.as_tensor(W[:PRIOR_FRAMES])
     visible = torch.ones(some.shape[:2], dtype=torch.bool)
     net.prior = learn_prior(net, *net.normalize(some, visible)[:2], visible)  # as `fit` leaves it, all kinds in use
     reconstruct(W[:100], model=net, refine=refine)  # libraries load on first use
-    before = _peak_mb()
+    before = peak_mb()
     start = time.perf_counter()
     rec = reconstruct(W, model=net, refine=refine)
     seconds = time.perf_counter() - start
     returned = sum(a.nbytes for a in (rec.shapes, rec.cameras, rec.translations, rec.visible)) / 1e6
-    peak = _peak_mb()
-    pipe.send({"frames_per_s": frames / seconds, "work_mb": peak - before - returned, "peak_mb": peak})
-
-
-def _peak_mb():
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
+    peak = peak_mb()
+    return {"frames_per_s": frames / seconds, "work_mb": peak - before - returned, "peak_mb": peak}

@@ -14,6 +14,7 @@ from ..reconstruction import reconstruct
 from ..training import SCHEDULES, fit
 
 _CMU = ("salsa", "indian", "martial")
+CLASSIC = ("drink", "pickup", "yoga", "stretch", "dance")
 QUICK_STEPS = 60
 # To compare settings of the network itself: longer than the default schedule, and without its pull.
 _LONG = replace(SCHEDULES["default"], steps=2700, pull=0.0)
@@ -21,7 +22,10 @@ _LONG = replace(SCHEDULES["default"], steps=2700, pull=0.0)
 
 @lru_cache(maxsize=4)
 def load(name):
-    """Landmarks with points3d: "motion", "motion-small", or a folder of `cmu_bvh`, "martial", "salsa" or "indian".
+    """Landmarks with points3d, by name.
+
+    Generated: "motion", "motion-small", or "motion-N" with N frames. A folder of `cmu_bvh`: "martial", "salsa" or
+    "indian". A file of `classic`: "drink", "pickup", "yoga", "stretch" or "dance".
 
     Raises FileNotFoundError, with a sentence, if real data is asked for and NRSFM_DATA does not lead to it.
     """
@@ -29,12 +33,22 @@ def load(name):
         return datasets.make_motion(4000, seed=0)
     if name == "motion-small":
         return datasets.make_motion(600, seed=0)
+    if name.startswith("motion-") and name[7:].isdigit():
+        return datasets.make_motion(int(name[7:]), seed=0)
+    if name in CLASSIC:
+        return datasets.load_classic(_real(f"classic/{name}.npz"))
     if name not in _CMU:
-        raise KeyError(f"unknown data {name!r}; there are motion, motion-small, {', '.join(_CMU)}.")
-    folder = Path(os.environ.get("NRSFM_DATA", Path.home() / ".cache/nrsfm_lite")) / "cmu_bvh" / name
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder; set NRSFM_DATA to a folder that holds cmu_bvh/{name}.")
-    return datasets.load_bvh(folder, joints=datasets.CMU_BODY)
+        known = ("motion", "motion-small", "motion-N", *_CMU, *CLASSIC)
+        raise KeyError(f"unknown data {name!r}; there are {', '.join(known)}.")
+    return datasets.load_bvh(_real(f"cmu_bvh/{name}"), joints=datasets.CMU_BODY)
+
+
+def _real(name):
+    """Where a file or folder of real data is."""
+    path = Path(os.environ.get("NRSFM_DATA", Path.home() / ".cache/nrsfm_lite")) / name
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: not there; set NRSFM_DATA to a folder that holds {name}.")
+    return path
 
 
 @lru_cache

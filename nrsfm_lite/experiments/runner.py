@@ -28,7 +28,7 @@ from . import material
 
 NAMES = (
     *("speed", "inference", "thresholds", "relaxation", "training", "coherence", "stress", "unseen"),
-    *("missing", "translation", "noise"),
+    *("missing", "translation", "noise", "classic", "growth"),
 )
 _LIBRARIES = ("torch", "numpy", "scipy")
 
