@@ -10,7 +10,7 @@ from .upgrade import trajectory_cameras
 from .variable_projection import Coefficients, fit
 
 
-def ksta(W, visible=None, rank=9, smoothness=0.1, dimensions=3, max_seconds=None, progress=True):
+def ksta(W, visible=None, rank=8, smoothness=0.1, dimensions=3, max_seconds=None, progress=True):
     """A point wanders smoothly through few dimensions, and the shape is a smooth function of where it is.
 
     Objective: ``min Σ_f ‖X_f − Σ_k κ(y_f, b_k) B_k M_f‖²`` over atoms B_k, centres b_k and the curve y, where κ is
@@ -22,7 +22,9 @@ def ksta(W, visible=None, rank=9, smoothness=0.1, dimensions=3, max_seconds=None
     steps for each of the two stages; memory O(F · rank² · P + (dq)²). Their published form holds a Jacobian of
     2FP × dq numbers; ours does not, but d grows with F, so time grows with F³.
 
-    Assumes orthographic views in *temporal order* from a slowly moving camera.
+    Assumes orthographic views in *temporal order* from a slowly moving camera. The last steps wander along a flat
+    valley of the objective: rounding alone can change the error on a classic sequence by a few per cent, and with too
+    high a rank by much more.
 
     Parameters
     ----------
@@ -52,9 +54,9 @@ def ksta(W, visible=None, rank=9, smoothness=0.1, dimensions=3, max_seconds=None
     -----
     Certain, from the abstract and from the authors' code of the linear method: the kernel, the smooth curve, the
     eliminated atoms, the cameras. Reconstructed by us, as neither code nor full text could be had: the kernel's
-    width (the median squared distance of the starting curve), the centres' start (farthest points of the curve)
-    and the starting curve (the first coefficients of the linear method). Rank, smoothness and dimensions per
-    sequence are not known to us either.
+    width (the median squared distance of the starting curve), the centres' start (farthest points of the curve) and
+    the starting curve (the main directions in which the linear method's shapes vary). Rank, smoothness and dimensions
+    per sequence are not known to us either.
     """
     images = read(W, visible, frames=6, points=6, method="ksta")
     F, P, _ = images.X.shape
@@ -70,14 +72,14 @@ def ksta(W, visible=None, rank=9, smoothness=0.1, dimensions=3, max_seconds=None
     watch = Watch("ksta", max_seconds, progress)
     M = trajectory_cameras(images.X)
     cosines = idct(np.eye(F, d), axis=0, norm="ortho")
-    S, linear, done = _linear(images.X, M, cosines, rank, watch)
+    S, done = _linear(images.X, M, cosines, rank, watch)
     if not watch.over:
-        S, done = _curved(images.X, M, cosines, linear[:, :dimensions], rank, watch)
+        S, done = _curved(images.X, M, cosines, _main_directions(S, dimensions), rank, watch)
     return images.reconstruction(S, M, "ksta", done)
 
 
 def _linear(X, M, cosines, rank, watch):
-    """Column space fitting: C = Ω Z. Returns shapes, C, and whether it converged."""
+    """Column space fitting: C = Ω Z. Returns shapes and whether it converged."""
     F, d = cosines.shape
     local, free = np.broadcast_to(np.eye(rank), (F, rank, rank)), np.zeros((F, rank, 0))
 
@@ -87,14 +89,20 @@ def _linear(X, M, cosines, rank, watch):
     def orthonormal(theta):  # the atoms undo any change of basis
         return np.linalg.qr(theta.reshape(d, rank))[0].ravel()
 
-    S, theta, done = fit(X, M, coefficients, np.eye(d, rank).ravel(), watch, tidy=orthonormal)
-    return S, coefficients(theta).C, done
+    S, _, done = fit(X, M, coefficients, np.eye(d, rank).ravel(), watch, tidy=orthonormal)
+    return S, done
+
+
+def _main_directions(S, q):
+    """Where the shapes are along the q directions in which they vary most: (F, q), each of variance 1."""
+    flat = (S - S.mean(0)).reshape(len(S), -1)
+    y = flat @ np.linalg.eigh(flat.T @ flat)[1][:, -q:]
+    return y / y.std(0)
 
 
 def _curved(X, M, cosines, y, rank, watch):
     """C = κ(Ω Z, b), from a starting curve y (F, q). Returns shapes and whether it converged."""
     (F, d), q = cosines.shape, y.shape[1]
-    y = y / y.std(0)
     width = np.median(pdist(y, "sqeuclidean"))
     split = d * q
 

@@ -1,5 +1,7 @@
 """The classic sequences: every classical method and the network, in both conventions (chapter 02)."""
 
+import numpy as np
+
 from .. import baselines, cameras, metrics
 from ..datasets import make_views
 from ..reconstruction import reconstruct
@@ -8,13 +10,16 @@ from . import material
 QUESTION = "What do the classical methods and the network reach on the five classic sequences, and in what time?"
 # Ranks per sequence: of pta from the data files of Akhter et al., of bmm from the code of Dai et al., of riks from
 # the authors' demonstration and, for pickup and yoga, from others' use of it; drink has none, and gets the default.
+# Those of ksta are not published: chosen here from 6 to 13 with the truth of these sequences at hand, which favours it.
 _RANKS = {
     "pta": {"drink": 13, "pickup": 12, "yoga": 11, "stretch": 12, "dance": 5},
+    "ksta": {"drink": 12, "pickup": 8, "yoga": 7, "stretch": 9, "dance": 8},
     "bmm": {"drink": 12, "pickup": 12, "yoga": 10, "stretch": 11, "dance": 10},
     "riks": {"drink": 7, "pickup": 3, "yoga": 7, "stretch": 8, "dance": 7},
 }
 _CAMERA_FRAME = ("cns", "sfc")  # methods without a world frame
 _BY_CHANCE = ("bmm", "cns", "sps", "sfc", "network")  # a seed decides
+_BY_ROUNDING = ("ksta",)  # the seed of noise far below any that a camera has
 _METHODS = ("tomasi_kanade", "pta", "ksta", "bmm", "riks", "riks asfm", "cns", "nlo", "sps", "sfc", "sfc 5", "network")
 _SEEDS = 3
 
@@ -28,7 +33,7 @@ def cases(quick):
         for s in range(_SEEDS)
         for m in _METHODS
         for d in material.CLASSIC
-        if s == 0 or m.split()[0] in _BY_CHANCE
+        if s == 0 or m.split()[0] in _BY_CHANCE + _BY_ROUNDING
     ]
 
 
@@ -36,6 +41,7 @@ def conditions(quick):
     """What all cases share."""
     return {
         "own": "the method's own parameters; all others are its defaults",
+        "seed": "of the method; of ksta, which has none, of noise of 1e-12 in the images: rounding changes it",
         "per_frame": "convention (a): normalised error, each frame rotated or reflected at its best, no scale fitted",
         "e3d_world": "convention (b), one rotation for all frames: shapes in the world; empty where the method has no "
         "world frame, or the world of the sequence is not known",
@@ -62,7 +68,10 @@ def measure(data, method, seed):
     own = _own(name, variant, data)
     how = own | ({"seed": seed} if name in _BY_CHANCE else {})
     how |= {} if name in ("tomasi_kanade", "pta") else {"progress": False}
-    rec = getattr(baselines, name)(truth.points2d, **how)
+    W = truth.points2d
+    if name in _BY_ROUNDING:
+        W = W + 1e-12 * np.random.default_rng(seed).normal(size=W.shape)
+    rec = getattr(baselines, name)(W, **how)
     return _errors(rec, truth, name) | {"one_pass": "", "own": " ".join(f"{k}={v}" for k, v in own.items())}
 
 
