@@ -1,6 +1,7 @@
 """The methods that factor the images over cameras found first: bmm, ksta, riks."""
 
 import inspect
+import sys
 
 import numpy as np
 import pytest
@@ -76,13 +77,19 @@ def test_riks_is_exact_on_its_own_model(seed, kernel):
 
 
 @pytest.mark.parametrize(
-    ("method", "own"), [(bmm, {"rank": 2}), (ksta, {"rank": 2, "dimensions": 1}), (riks, {"rank": 2})]
+    ("method", "own"),
+    [
+        (nl.baselines.pta, {"rank": 4}),
+        (bmm, {"rank": 2, "progress": False}),
+        (ksta, {"rank": 2, "dimensions": 1, "progress": False}),
+        (riks, {"rank": 2, "progress": False}),
+    ],
 )
 def test_a_fifth_missing_on_a_smooth_sequence(video, rng, method, own):
     visible = rng.random((90, 30)) > 0.2
     W = np.where(visible[..., None], 7 * video.points2d + (100, -40), np.nan)
-    rec = method(W, visible, **own, progress=False)
-    complete = nl.metrics.normalized_error(method(video, **own, progress=False).shapes, video.points3d).mean()
+    rec = method(W, visible, **own)
+    complete = nl.metrics.normalized_error(method(video, **own).shapes, video.points3d).mean()
     assert nl.metrics.normalized_error(rec.shapes, video.points3d).mean() < complete + 0.05
     assert np.abs(rec.translations - (100, -40)).max() < 7  # in the user's units
     np.testing.assert_array_equal(rec.visible, visible)
@@ -92,7 +99,7 @@ def test_a_fifth_missing_on_a_smooth_sequence(video, rng, method, own):
 def test_time_limit_and_refusals(video, method):
     rec = method(video, rank=4, max_seconds=1e-3, progress=False)
     assert not rec.converged and np.isfinite(rec.shapes).all() and rec.method == method.__name__
-    with pytest.raises(ValueError, match=r"rank=11; expected \d … 10 for 90 frames and 30 points"):
+    with pytest.raises(ValueError, match=r"rank=11; expected a whole number, \d … 10 for 90 frames and 30 points"):
         method(video, rank=11)
     with pytest.raises(ValueError, match="max_seconds=0; expected a positive"):
         method(video, max_seconds=0)
@@ -106,6 +113,8 @@ def test_own_parameters_out_of_range(video):
     for method, wrong in [
         (bmm, {"restarts": 0}),
         (ksta, {"dimensions": 9}),
+        (bmm, {"rank": 2.5}),
+        (riks, {"rank": 2.5}),
         (ksta, {"smoothness": 0}),
         (riks, {"basis": 1.5}),
         (riks, {"kernel": "gauss"}),
@@ -113,6 +122,42 @@ def test_own_parameters_out_of_range(video):
         ((name, value),) = wrong.items()
         with pytest.raises(ValueError, match=f"{name}={value!r}; expected"):
             method(video, **wrong, progress=False)
+
+
+def test_fewer_points_take_a_smaller_rank(rng):
+    video = low_rank(rng, 0.3 * np.sin(np.linspace(0, 5, 40))[:, None], circling(40))
+    for method in METHODS:
+        assert np.isfinite(method(video.points2d[:, :7], progress=False).shapes).all()
+
+
+def test_a_rigid_video_is_referred_to_the_rigid_method(rng):
+    S = np.repeat(rng.normal(size=(1, 9, 3)), 20, axis=0)
+    for method in (nl.baselines.pta, ksta, riks):
+        with pytest.raises(ValueError, match="W has rank 3, as a rigid object's images have: tomasi_kanade"):
+            method(S @ circling(20), rank=2)
+
+
+def test_singular_steps_are_no_crash():
+    """Directions that change nothing, and little damping left: 30 frames of a motion, all components."""
+    clip = nl.datasets.make_motion(30, seed=0)
+    assert np.isfinite(riks(clip.points3d @ circling(30), rank=3, progress=False).shapes).all()
+
+
+def test_one_frame_on_a_line_does_not_spoil_the_cameras(rng):
+    data = low_rank(rng, 0.4 * rng.normal(size=(120, 1)), nl.cameras.random_cameras(120, seed=1))
+    for axis in (0, 1):
+        W = data.points2d.copy()
+        W[3, :, axis] = 0
+        rec = bmm(W, rank=2, progress=False)
+        others = np.arange(120) != 3
+        found = nl.metrics.normalized_error(rec.shapes[others], data.points3d[others], scale=False)
+        assert found.mean() < 0.1
+
+
+def test_bmm_says_when_its_steps_did_not_settle(rng, monkeypatch):
+    data = low_rank(rng, 0.4 * rng.normal(size=(40, 1)), nl.cameras.random_cameras(40, seed=1))
+    monkeypatch.setattr(sys.modules["nrsfm_lite.baselines.bmm"], "_ITERATIONS", 1)
+    assert not bmm(data, rank=2, progress=False).converged
 
 
 def test_too_large_is_refused_beforehand():

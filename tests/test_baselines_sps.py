@@ -140,16 +140,16 @@ def test_gluing_survives_wrong_cameras(rng):
 def test_refusals():
     W = block_sparse(0, frames=20, points=12).points2d
     for message, options in [
-        (r"active=4; expected 1 … 3 for 12 points", {"active": 4}),
+        (r"needs at least 7 frames and 14 points; got 20 and 12", {"active": 4}),
         (r"active=0", {"active": 0}),
-        (r"atoms=2; expected 3 … 8 for 20 frames", {"atoms": 2}),
-        (r"atoms=9; expected 3 … 8", {"atoms": 9}),
-        (r"restarts=0; expected 1 or more", {"restarts": 0, "atoms": 5}),
+        (r"atoms=2; expected a whole number, 3 … 8 for 20 frames", {"atoms": 2}),
+        (r"atoms=9; expected a whole number, 3 … 8", {"atoms": 9}),
+        (r"restarts=0; expected a whole number", {"restarts": 0, "atoms": 5}),
         (r"max_seconds=0", {"max_seconds": 0, "atoms": 5}),
     ]:
         with pytest.raises(ValueError, match=message):
             sps(W, progress=False, **options)
-    with pytest.raises(ValueError, match="sps needs at least 5 frames"):
+    with pytest.raises(ValueError, match="sps needs at least 8 frames"):
         sps(W[:4])
     with pytest.raises(ValueError, match="point 2 is hidden in every frame"):
         sps(W, np.arange(240).reshape(20, 12) % 12 != 2, atoms=5)

@@ -10,7 +10,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from ..threads import use_threads
 from .images import read
-from .limits import Watch, check_cost
+from .limits import Watch, check_cost, check_whole
 from .weak import weak_depths
 
 _GROUPS = 32  # at a time: few large operations in place of many small ones
@@ -74,20 +74,18 @@ def cns(W, visible=None, group_size=10, groups_per_point=50, locality=0.1, max_s
     method in place of the power method, and the consensus starts where its penalty begins to matter. On data
     without noise the cameras of a group, not quite determined, converge so slowly that they are stopped.
     """
-    if not group_size >= 4:
-        raise ValueError(f"group_size={group_size}; expected at least 4 points.")
-    if not groups_per_point >= 1:
-        raise ValueError(f"groups_per_point={groups_per_point}; expected at least 1.")
+    check_whole("group_size", group_size, 4, 1000)
+    check_whole("groups_per_point", groups_per_point, 1, 10_000)
     if not 0 <= locality < np.inf:
         raise ValueError(f"locality={locality}; expected 0 or a positive number.")
     images = read(W, visible, frames=max(3, (group_size + 1) // 2), method="cns")
     F, P, _ = images.X.shape
     watch = Watch("cns", max_seconds, progress)
-    groups = sample_groups(images.X, min(group_size, P), groups_per_point, locality, np.random.default_rng(seed))
-    m, n = groups.shape
-    check_cost(
-        "cns", F, 1e-9 * F * m * n * 48, m * (0.03 + 2.4e-4 * F), max_seconds, "Fewer groups_per_point cost less."
-    )
+    n = min(group_size, P)
+    m = 1.3 * groups_per_point * P / n  # about so many groups
+    numbers = 48 / 8 * F * m * n + 3 * (P + m) ** 2
+    check_cost("cns", F, 8 * numbers / 2**30, m * (0.03 + 2.4e-4 * F), max_seconds, "Fewer groups_per_point cost less.")
+    groups = sample_groups(images.X, n, groups_per_point, locality, np.random.default_rng(seed))
     with use_threads(1):
         depths, finished = _depths(images.X, groups, watch)
     groups = groups[: len(depths)]

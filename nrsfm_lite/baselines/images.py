@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from .. import preprocessing
+from ..cameras import nearest_orthonormal
 from ..completion import complete
 from ..data import Reconstruction, as_points
 
@@ -30,21 +31,24 @@ class Images:
     names: tuple
     edges: np.ndarray
 
-    def stacked(self):
-        """(2F, P): two rows per frame, x and y."""
-        return self.X.transpose(0, 2, 1).reshape(-1, self.X.shape[1])
-
     def reconstruction(self, S, M, method, converged=True, t=None):
         """The result in the user's units.
 
-        S (F, P, 3) and t (F, 2), an image translation, are in the units of X, and M (F, 3, 2) are the cameras.
+        S (F, P, 3) and t (F, 2), an image translation, are in the units of X, and M (F, 3, 2) are the cameras, of
+        which the nearest orthonormal ones are returned.
         """
+        M = nearest_orthonormal(torch.as_tensor(M)).numpy()
         centre = S.mean(1, keepdims=True)
         t = (0 if t is None else t) + (centre @ M)[:, 0]  # the image of the centroid
         return Reconstruction(
             shapes=(S - centre) * self.scale, cameras=M, translations=self.t + t * self.scale,
             visible=self.visible, names=self.names, edges=self.edges, method=method, converged=converged,
         )  # fmt: skip
+
+
+def stacked(X):
+    """(F, P, 2) to (2F, P): two rows per frame, x and y."""
+    return X.transpose(0, 2, 1).reshape(-1, X.shape[1])
 
 
 def read(W, visible=None, *, fill=True, frames=3, points=4, method="this method"):

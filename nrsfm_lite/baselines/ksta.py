@@ -5,12 +5,15 @@ from scipy.fft import idct
 from scipy.spatial.distance import cdist, pdist
 
 from .images import read
-from .limits import Watch, check_cost
+from .limits import Watch, check_cost, check_whole
 from .upgrade import trajectory_cameras
-from .variable_projection import Coefficients, fit
+from .variable_projection import Coefficients, fit, linear
+
+_RANK = 8  # where the points allow it
+_PAIRS = 2000  # frames, drawn evenly, whose distances give the kernel its width
 
 
-def ksta(W, visible=None, rank=8, smoothness=0.1, dimensions=3, max_seconds=None, progress=True):
+def ksta(W, visible=None, rank=None, smoothness=0.1, dimensions=None, max_seconds=None, progress=True):
     """A point wanders smoothly through few dimensions, and the shape is a smooth function of where it is.
 
     Objective: ``min Σ_f ‖X_f − Σ_k κ(y_f, b_k) B_k M_f‖²`` over atoms B_k, centres b_k and the curve y, where κ is
@@ -31,12 +34,12 @@ def ksta(W, visible=None, rank=8, smoothness=0.1, dimensions=3, max_seconds=None
     W : Landmarks, or (F, P, 2) array of image points, in temporal order
     visible : (F, P) bool, optional
         Hidden points are filled in by `complete` first.
-    rank : int
-        Number of atoms and centres K; 3K at most P and 2F.
+    rank : int, optional
+        Number of atoms and centres K, with 3K at most P and 2F. Default: 8, or the largest possible.
     smoothness : float
         Number of cosines over the number of frames: .1 for slow, .3 for fast motion; at least `rank` are taken.
-    dimensions : int
-        Of the curve, q, less than `rank`: 2 or 3.
+    dimensions : int, optional
+        Of the curve, q, less than `rank`: 2 or 3. Default: 3 where the rank allows it.
     max_seconds : float, optional
         Then the result so far is returned, with ``converged=False``.
     progress : bool
@@ -48,7 +51,8 @@ def ksta(W, visible=None, rank=8, smoothness=0.1, dimensions=3, max_seconds=None
     Raises
     ------
     ValueError
-        As `images.read`; for a parameter out of range; or if memory or time would not suffice.
+        As `images.read` and `trajectory_cameras`; for a parameter out of range; or if memory or time would not
+        suffice.
 
     Notes
     -----
@@ -61,10 +65,10 @@ def ksta(W, visible=None, rank=8, smoothness=0.1, dimensions=3, max_seconds=None
     images = read(W, visible, frames=6, points=6, method="ksta")
     F, P, _ = images.X.shape
     most = min(P, 2 * F) // 3
-    if not 1 < rank <= most:
-        raise ValueError(f"rank={rank}; expected 2 … {most} for {F} frames and {P} points.")
-    if not 1 <= dimensions < rank:
-        raise ValueError(f"dimensions={dimensions}; expected 1 … {rank - 1}, less than the rank.")
+    rank = min(_RANK, most) if rank is None else rank
+    check_whole("rank", rank, 2, most, f" for {F} frames and {P} points")
+    dimensions = min(3, rank - 1) if dimensions is None else dimensions
+    check_whole("dimensions", dimensions, 1, rank - 1, ", less than the rank")
     if not 0 < smoothness <= 1:
         raise ValueError(f"smoothness={smoothness}; expected a share of the frames, above 0 and at most 1.")
     d = max(rank, round(smoothness * F))
@@ -80,16 +84,12 @@ def ksta(W, visible=None, rank=8, smoothness=0.1, dimensions=3, max_seconds=None
 
 def _linear(X, M, cosines, rank, watch):
     """Column space fitting: C = Ω Z. Returns shapes and whether it converged."""
-    F, d = cosines.shape
-    local, free = np.broadcast_to(np.eye(rank), (F, rank, rank)), np.zeros((F, rank, 0))
-
-    def coefficients(theta):
-        return Coefficients(cosines @ theta.reshape(d, rank), cosines, local, free)
+    coefficients, start = linear(cosines, rank)
 
     def orthonormal(theta):  # the atoms undo any change of basis
-        return np.linalg.qr(theta.reshape(d, rank))[0].ravel()
+        return np.linalg.qr(theta.reshape(-1, rank))[0].ravel()
 
-    S, _, done = fit(X, M, coefficients, np.eye(d, rank).ravel(), watch, tidy=orthonormal)
+    S, _, done = fit(X, M, coefficients, start, watch, tidy=orthonormal)
     return S, done
 
 
@@ -103,7 +103,7 @@ def _main_directions(S, q):
 def _curved(X, M, cosines, y, rank, watch):
     """C = κ(Ω Z, b), from a starting curve y (F, q). Returns shapes and whether it converged."""
     (F, d), q = cosines.shape, y.shape[1]
-    width = np.median(pdist(y, "sqeuclidean"))
+    width = np.median(pdist(y[:: -(-F // _PAIRS)], "sqeuclidean"))
     split = d * q
 
     def coefficients(theta):
@@ -131,5 +131,5 @@ def _spread_out(y, n):
 def _cost(F, P, d, rank):
     """Gigabytes and seconds, roughly."""
     n = d * rank
-    gigabytes = 8 * (6 * F * rank**2 * P + 3 * n**2 + F * rank**2 * d) / 2**30
+    gigabytes = 8 * (6 * F * rank**2 * P + 7 * n**2 + F * rank**2 * d + _PAIRS**2) / 2**30
     return gigabytes, 100 * (2 * F * n**2 + n**3 + 12 * F * rank * n * P) / 1e10

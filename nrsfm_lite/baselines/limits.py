@@ -1,12 +1,18 @@
 """Progress, the time a user grants, and a refusal before a machine is brought down."""
 
 import time
+from pathlib import Path
 
+import numpy as np
 import psutil
 from tqdm.auto import tqdm
 
 _SHARE = 0.8  # of the free memory that a method may take
 LONG = 3600  # seconds that nobody is made to wait unasked
+
+
+class TooLarge(ValueError):
+    """A method's refusal beforehand."""
 
 
 class Watch:
@@ -55,16 +61,31 @@ def check_cost(method, frames, gigabytes, seconds=0, max_seconds=None, advice=""
 
     Raises
     ------
-    ValueError
+    TooLarge, a ValueError
     """
-    free = psutil.virtual_memory().available / 2**30
+    free = _free_bytes() / 2**30
     if gigabytes > _SHARE * free:
-        raise ValueError(
+        raise TooLarge(
             f"{method} would need about {gigabytes:.1f} GB of memory for {frames} frames, and {free:.1f} GB are free."
             f" {advice}".rstrip()
         )
     if max_seconds is None and seconds > LONG:
-        raise ValueError(
+        raise TooLarge(
             f"{method} would take up to about {seconds / 3600:.1f} hours for {frames} frames; give max_seconds to have "
             f"the best result of that time. {advice}".rstrip()
         )
+
+
+def check_whole(name, value, least, most, circumstance=""):
+    """Raise ValueError unless a parameter is a whole number from `least` to `most`."""
+    if not (isinstance(value, (int, np.integer)) and least <= value <= most):
+        raise ValueError(f"{name}={value}; expected a whole number, {least} … {most}{circumstance}.")
+
+
+def _free_bytes():
+    """Memory that is free, inside a container also by its own limit."""
+    free = psutil.virtual_memory().available
+    try:
+        return min(free, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    except (OSError, ValueError):  # no container, or one without a limit
+        return free

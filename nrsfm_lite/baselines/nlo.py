@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ..cameras import rotations
 from .images import read
-from .limits import Watch, check_cost
+from .limits import Watch, check_cost, check_whole
 from .rigid import tomasi_kanade
 
 _DAMPING = 1e-3, 1e-12, 1e12  # at the start, the least, and where nothing is left to gain
@@ -127,8 +127,7 @@ def nlo(W, visible=None, rank=3, prior=1e-2, mean_prior=1e-3, max_seconds=None, 
 
 
 def _check(rank, prior, mean_prior):
-    if not (isinstance(rank, (int, np.integer)) and rank >= 1):
-        raise ValueError(f"rank={rank}; expected a whole number of at least 1.")
+    check_whole("rank", rank, 1, 1000)
     for name, value in [("prior", prior), ("mean_prior", mean_prior)]:
         if not 0 <= value < np.inf:
             raise ValueError(f"{name}={value}; expected a number of at least 0.")

@@ -3,7 +3,8 @@
 import numpy as np
 from scipy.fft import idct
 
-from .images import read
+from .images import read, stacked
+from .limits import check_whole
 from .upgrade import trajectory_cameras
 
 
@@ -32,16 +33,14 @@ def pta(W, visible=None, rank=12):
     Raises
     ------
     ValueError
-        For a rank out of range, fewer than 6 independent measurements (points or frames), or a point hidden
-        in every frame.
+        As `images.read` and `trajectory_cameras`; or for a rank out of range.
     """
-    images = read(W, visible, method="pta")
+    images = read(W, visible, points=6, method="pta")
     F, P, _ = images.X.shape
-    if rank < 1 or 3 * rank > 2 * F:
-        raise ValueError(f"rank={rank}; expected 1 … {2 * F // 3} for {F} frames.")
+    check_whole("rank", rank, 1, 2 * F // 3, f" for {F} frames")
     M = trajectory_cameras(images.X)  # (F, 3, 2)
     cosines = idct(np.eye(F, rank), axis=0, norm="ortho")  # (F, rank)
     # Row (f, j) of the system: x_fj = Σ_k θ_fk m_fjᵀ B_k, for all points at once.
     system = np.einsum("fij,fk->fjki", M, cosines).reshape(2 * F, 3 * rank)
-    B = np.linalg.lstsq(system, images.stacked(), rcond=None)[0].reshape(rank, 3, P)
+    B = np.linalg.lstsq(system, stacked(images.X), rcond=None)[0].reshape(rank, 3, P)
     return images.reconstruction(np.einsum("fk,kip->fpi", cosines, B), M, "pta")

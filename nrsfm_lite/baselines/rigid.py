@@ -4,7 +4,10 @@ import numpy as np
 import torch
 
 from ..cameras import nearest_orthonormal
-from .images import read
+from .images import read, stacked
+from .upgrade import quadratic, symmetric
+
+_UNSEEN = 1e-4  # share of its images that a direction must have
 
 
 def tomasi_kanade(W, visible=None):
@@ -34,31 +37,23 @@ def tomasi_kanade(W, visible=None):
     """
     images = read(W, visible, method="tomasi_kanade")
     F = len(images.X)
-    U, s, _ = np.linalg.svd(images.stacked(), full_matrices=False)
+    U, s, _ = np.linalg.svd(stacked(images.X), full_matrices=False)
     if s[2] <= 1e-9 * s[0]:
         raise ValueError("W has rank below 3: the points lie in one plane, or all views are alike.")
     motion = (U[:, :3] * np.sqrt(s[:3])).reshape(F, 2, 3)
     G = _metric_upgrade(motion)
     M = nearest_orthonormal(torch.as_tensor((motion @ G).transpose(0, 2, 1).copy())).numpy()  # (F, 3, 2)
     # Not G⁻¹ times the other factor: where Q is nearly singular, as on much that is not rigid, that has no bound.
+    # For the same reason, what hardly any camera sees stays flat.
     planes, laid = np.einsum("fij,fkj->ik", M, M), np.einsum("fpj,fij->ip", images.X, M)
-    S = np.linalg.solve(planes, laid).T  # (P, 3)
+    S = (np.linalg.pinv(planes, rcond=_UNSEEN, hermitian=True) @ laid).T  # (P, 3)
     return images.reconstruction(np.repeat(S[None], F, axis=0), M, "tomasi_kanade")
 
 
 def _metric_upgrade(motion):
     """G (3, 3) such that the rows of motion_f @ G are orthonormal, in the least-squares sense."""
-    upper = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
-
-    def row(a, b):  # aᵀ Q b as a linear function of the six entries of Q: (F, 6)
-        return np.stack([a[:, i] * b[:, j] + (a[:, j] * b[:, i] if i != j else 0) for i, j in upper], 1)
-
     x, y = motion[:, 0], motion[:, 1]
-    system = np.concatenate([row(x, x), row(y, y), row(x, y)])
+    system = np.concatenate([quadratic(x, x), quadratic(y, y), quadratic(x, y)])
     target = np.repeat([1.0, 1.0, 0.0], len(motion))
-    q = np.linalg.lstsq(system, target, rcond=None)[0]
-    Q = np.zeros((3, 3))
-    for value, (i, j) in zip(q, upper, strict=True):
-        Q[i, j] = Q[j, i] = value
-    values, vectors = np.linalg.eigh(Q)
+    values, vectors = np.linalg.eigh(symmetric(np.linalg.lstsq(system, target, rcond=None)[0]))
     return vectors * np.sqrt(np.maximum(values, 1e-6 * values.max()))

@@ -4,16 +4,17 @@ import numpy as np
 import torch
 
 from ..threads import use_threads
-from .images import read
-from .limits import Watch, check_cost
+from .images import read, stacked
+from .limits import Watch, check_cost, check_whole
 from .upgrade import trajectory_cameras
-from .variable_projection import Coefficients, fit
+from .variable_projection import fit, linear
 
 KERNELS = ("asfm", "rik")
+_RANK = 7  # where the points allow it
 _ENERGY = 0.99  # of the kernel's spectrum, that the basis keeps
 
 
-def riks(W, visible=None, rank=7, basis=0.2, kernel="asfm", max_seconds=None, progress=True):
+def riks(W, visible=None, rank=None, basis=0.2, kernel="asfm", max_seconds=None, progress=True):
     """As column space fitting, but coefficients are smooth over *likeness of images* instead of time.
 
     Objective: ``min Σ_f ‖X_f − Σ_k c_fk B_k M_f‖²`` with C = Φ Z, where Φ (F, d) are the main components of a
@@ -34,8 +35,9 @@ def riks(W, visible=None, rank=7, basis=0.2, kernel="asfm", max_seconds=None, pr
     W : Landmarks, or (F, P, 2) array of image points
     visible : (F, P) bool, optional
         Hidden points are filled in by `complete` first.
-    rank : int
-        Number of atoms K; 3K at most P and 2F. The authors take 5 to 8, others 3 for `pickup`.
+    rank : int, optional
+        Number of atoms K, with 3K at most P and 2F. The authors take 5 to 8, others 3 for `pickup`. Default: 7, or
+        the largest possible.
     basis : float
         Number of components over the number of frames: .1 to .3 in the authors' demonstration.
     kernel : "asfm" or "rik"
@@ -50,7 +52,8 @@ def riks(W, visible=None, rank=7, basis=0.2, kernel="asfm", max_seconds=None, pr
     Raises
     ------
     ValueError
-        As `images.read`; for a parameter out of range; or if memory or time would not suffice.
+        As `images.read` and `trajectory_cameras`; for a parameter out of range; or if memory or time would not
+        suffice.
 
     Notes
     -----
@@ -60,8 +63,8 @@ def riks(W, visible=None, rank=7, basis=0.2, kernel="asfm", max_seconds=None, pr
     images = read(W, visible, frames=6, points=6, method="riks")
     F, P, _ = images.X.shape
     most = min(P, 2 * F) // 3
-    if not 1 <= rank <= most:
-        raise ValueError(f"rank={rank}; expected 1 … {most} for {F} frames and {P} points.")
+    rank = min(_RANK, most) if rank is None else rank
+    check_whole("rank", rank, 1, most, f" for {F} frames and {P} points")
     if not 0 < basis <= 1:
         raise ValueError(f"basis={basis}; expected a share of the frames, above 0 and at most 1.")
     if kernel not in KERNELS:
@@ -72,12 +75,7 @@ def riks(W, visible=None, rank=7, basis=0.2, kernel="asfm", max_seconds=None, pr
     M = trajectory_cameras(images.X)
     distances = _unlike_in_space(images.X) if kernel == "asfm" else _unlike_in_the_plane(images.X)
     components = _components(distances, d, watch)
-    local, free = np.broadcast_to(np.eye(rank), (F, rank, rank)), np.zeros((F, rank, 0))
-
-    def coefficients(theta):
-        return Coefficients(components @ theta.reshape(d, rank), components, local, free)
-
-    start = np.eye(d, rank).ravel()
+    coefficients, start = linear(components, rank)
     S, _, done = fit(images.X, M, coefficients, start, watch, sequential=True, iterations=300, tolerance=1e-9)
     return images.reconstruction(S, M, "riks", done)
 
@@ -91,8 +89,8 @@ def _unlike_in_the_plane(X):
 
 def _unlike_in_space(X):
     """(F, F): the energy of two images, stacked to four rows, outside their best rank 3, which a rigid body has."""
-    F, P, _ = X.shape
-    rows = X.transpose(0, 2, 1).reshape(2 * F, P)
+    F = len(X)
+    rows = stacked(X)
     products = torch.as_tensor(rows @ rows.T).view(F, 2, F, 2).transpose(1, 2)  # (F, F, 2, 2)
     own = products.diagonal().permute(2, 0, 1)  # (F, 2, 2), each image with itself
     E = torch.empty(F, F, dtype=torch.float64)
@@ -127,5 +125,5 @@ def _kernel(E, ordered, neighbour):
 def _cost(F, P, d, rank):
     """Gigabytes and seconds, roughly."""
     n = d * rank
-    gigabytes = 8 * (6 * F**2 + 6 * F * rank**2 * P + 3 * n**2) / 2**30
+    gigabytes = 8 * (6 * F**2 + 6 * F * rank**2 * P + 7 * n**2) / 2**30
     return gigabytes, (4e-11 * F**3 * np.log2(F)) + 150 * (2 * F * n**2 + n**3 + 12 * F * rank * n * P) / 1e10

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .images import read
-from .limits import Watch, check_cost
+from .limits import Watch, check_cost, check_whole
+from .upgrade import quadratic, symmetric
 
 _START = 1e-2, 1e-1  # weights of the two constraints M = Z and A = B at the first iteration
 _GROWTH = 1.1  # of both weights, per iteration
@@ -88,13 +89,12 @@ def sfc(
     size = np.sqrt((X**2).sum((1, 2), keepdims=True))
     X = X / size
     watch = Watch("sfc", max_seconds, progress)
-    best, best_value, converged = None, np.inf, True
+    best, best_value, converged = None, np.inf, False
     rng = np.random.default_rng(seed)
     for _ in range(restarts):
         state, value, done = _descend(_start(F, P, rank, rng), X, seen, penalty, watch)
-        converged &= done
         if best is None or (value < best_value and done):
-            best, best_value = state, value
+            best, best_value, converged = state, value, done
         if watch.over:
             break
     if upgrade:
@@ -105,9 +105,8 @@ def sfc(
 
 
 def _check(rank, penalty, restarts, upgrade):
-    for name, value in [("rank", rank), ("restarts", restarts)]:
-        if not (isinstance(value, (int, np.integer)) and value >= 1):
-            raise ValueError(f"{name}={value}; expected a whole number of at least 1.")
+    check_whole("rank", rank, 1, 1000)
+    check_whole("restarts", restarts, 1, 1000)
     if not 0 < penalty < np.inf:
         raise ValueError(f"penalty={penalty}; expected a positive number.")
     if upgrade and rank > 1:
@@ -247,15 +246,8 @@ def _upgrade(s, X, seen):
     s.Z = _codes(s.A, (X - s.t) * seen, seen, np.zeros_like(s.Z), 1e-12)
     s.t = _shift(X - s.Z @ s.A, seen)
     x, y = s.Z.swapaxes(0, 1) / np.sqrt((s.Z**2).sum((1, 2)))[:, None]
-    upper = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
-
-    def product(a, b):  # aᵀ Q b as a linear function of the six entries of Q: (F, 6)
-        return np.stack([a[:, i] * b[:, j] + (a[:, j] * b[:, i] if i != j else 0) for i, j in upper], 1)
-
-    system = np.concatenate([product(x, x) - product(y, y), 2 * product(x, y)])
-    Q = np.zeros((3, 3))
-    for value, (i, j) in zip(np.linalg.eigh(system.T @ system)[1][:, 0], upper, strict=True):
-        Q[i, j] = Q[j, i] = value
+    system = np.concatenate([quadratic(x, x) - quadratic(y, y), 2 * quadratic(x, y)])
+    Q = symmetric(np.linalg.eigh(system.T @ system)[1][:, 0])
     values, vectors = np.linalg.eigh(Q * np.sign(np.trace(Q)))
     if values[0] <= 1e-6 * values[2]:
         raise ValueError("upgrade=True, but no rigid object comes near these images; expected upgrade=False for them.")

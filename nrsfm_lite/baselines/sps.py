@@ -6,8 +6,8 @@ import torch
 from ..cameras import nearest_orthonormal, rotations
 from .block_ksvd import learn_atoms
 from .images import read
-from .limits import Watch, check_cost
-from .upgrade import consistent
+from .limits import Watch, check_cost, check_whole
+from .upgrade import consistent, quadratic, symmetric
 
 _FRAMES_PER_ATOM = 5  # three determine an upgrade; the authors sample five
 _PRESENT = 0.05  # share of an image's norm below which an atom's code is too short to tell a camera
@@ -80,9 +80,13 @@ def sps(W, visible=None, atoms=10, active=2, restarts=5, max_seconds=None, progr
     (600 frames, 31 points). With 8 atoms in 20 points, 24 dimensions in 19, five starts were exact in 7 of 10 sets; in
     the others the greedy choice took wrong atoms in a few frames.
     """
-    images = read(W, visible, method="sps", frames=_FRAMES_PER_ATOM, points=5)
+    check_whole("active", active, 1, 100)
+    least = active + (active > 1)  # atoms that are always in company cannot be told apart
+    fewest = -(-_FRAMES_PER_ATOM * least // active)
+    images = read(W, visible, method="sps", frames=fewest, points=3 * active + 2)
     F, P, _ = images.X.shape
-    _check(F, P, atoms, active, restarts)
+    check_whole("atoms", atoms, least, F * active // _FRAMES_PER_ATOM, f" for {F} frames with active={active}")
+    check_whole("restarts", restarts, 1, 1000)
     gigabytes = 2 * F * (30 * atoms + 10 * P + 9 * active**2) * 8 / 2**30
     # Measured with 2,000 to 10,500 frames: the convex start, and the 50 steps of K-SVD that are common (500 at most).
     seconds = restarts * F * (1.2e-4 * atoms + 3e-4 * active) * max(1, P / 31)
@@ -94,19 +98,9 @@ def sps(W, visible=None, atoms=10, active=2, restarts=5, max_seconds=None, progr
     return images.reconstruction(sign * S, signed, "sps", converged)
 
 
-def _check(F, P, atoms, active, restarts):
-    if active < 1 or 3 * active > P - 2:
-        raise ValueError(f"active={active}; expected 1 … {(P - 2) // 3} for {P} points.")
-    least, most = active + (active > 1), F * active // _FRAMES_PER_ATOM  # always in company, atoms cannot be told apart
-    if not least <= atoms <= most:
-        raise ValueError(f"atoms={atoms}; expected {least} … {most} for {F} frames with active={active}.")
-    if restarts < 1:
-        raise ValueError(f"restarts={restarts}; expected 1 or more.")
-
-
 def _best(images, atoms, active, restarts, rng, watch):
     """Of the start with the lowest reprojection error S, M, and whether all went well; and the number of starts."""
-    rows = images.stacked().reshape(len(images.X), 2, -1)
+    rows = images.X.swapaxes(1, 2).copy()
     best, least, used = None, np.inf, 0
     while used < restarts and not (used and watch.over):
         used += 1
@@ -146,14 +140,8 @@ def _upgrade(U, support, codes):
 def _metric(rows):
     """G (3, 3) such that the two rows of rows_f @ G (n, 2, 3) are orthogonal and of one length; and if it exists."""
     x, y = rows[:, 0], rows[:, 1]
-    i, j = np.triu_indices(3)
-
-    def quadratic(a, b):  # aᵀ Q b as a linear function of the six entries of Q: (n, 6)
-        return np.where(i == j, 0.5, 1) * (a[:, i] * b[:, j] + a[:, j] * b[:, i])
-
     system = np.concatenate([quadratic(x, x) - quadratic(y, y), 2 * quadratic(x, y)])
-    Q = np.zeros((3, 3))
-    Q[i, j] = Q[j, i] = np.linalg.svd(system, full_matrices=len(system) < 6)[2][-1]
+    Q = symmetric(np.linalg.svd(system, full_matrices=len(system) < 6)[2][-1])
     values, vectors = np.linalg.eigh(Q)
     definite = len(rows) >= _FRAMES_PER_ATOM and abs(np.sign(values).sum()) == 3
     size = np.abs(values)

@@ -1,10 +1,11 @@
-"""From factors to cameras: the Euclidean upgrade of smooth motions, and the signs of its frames."""
+"""From factors to cameras: Euclidean upgrades, for videos and for frames in no order, and the signs of frames."""
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
 
 from ..cameras import nearest_orthonormal
+from .images import stacked
 
 
 def trajectory_cameras(X):
@@ -24,12 +25,20 @@ def trajectory_cameras(X):
     -------
     (F, 3, 2), orthonormal up to what the upgrade leaves: as in the reference code, they are not corrected.
     The signs of the frames are made continuous.
+
+    Raises
+    ------
+    ValueError
+        With fewer than 6 points, or images of rank 3 or less: those of a rigid object, or all alike.
     """
-    F, P, _ = X.shape
-    U, s, _ = np.linalg.svd(X.transpose(0, 2, 1).reshape(2 * F, P), full_matrices=False)
-    n = min(3 * int(np.ceil((s > 1e-4 * s[0]).sum() / 3)), len(s))
+    F = len(X)
+    U, s, _ = np.linalg.svd(stacked(X), full_matrices=False)
+    rank = int((s > 1e-4 * s[0]).sum())
+    if rank <= 3:
+        raise ValueError(f"W has rank {rank}, as a rigid object's images have: tomasi_kanade is made for these.")
+    n = min(3 * int(np.ceil(rank / 3)), len(s))
     if n < 6:
-        raise ValueError(f"W has rank {n}; the upgrade needs at least 6 independent components.")
+        raise ValueError(f"W has {len(s)} components; the cameras of a deforming shape need at least 6 points.")
     motion = (U[:, :n] * np.sqrt(s[:n])).reshape(F, 2, n)
     Q, best = np.eye(6, 3), np.inf
     for size in range(6, n + 1, 3):
@@ -61,7 +70,9 @@ def unordered_cameras(X, rank, starts, rng):
     """Cameras of shapes of low rank, in any order of the frames: the upgrade of the block matrix method.
 
     As in `trajectory_cameras`, three columns G of the upgrade make each frame's two rows orthonormal, here of any
-    length: the sum over frames of (1 − ‖r₂‖²/‖r₁‖²)² + 4 (r₁·r₂/‖r₁‖²)² is minimised over 3·rank components.
+    length: the sum over frames of ((a − b)² + 4 c²) / (a + b)², with a = ‖r₁‖², b = ‖r₂‖², c = r₁·r₂, is minimised
+    over 3·rank components. (The authors divide by a² instead, with the same minima on the classic sequences; but then
+    one frame whose points lie on a vertical line spoils all cameras.)
     Dai et al. (2014) start from a semidefinite programme. That start is poor (baselines are compared in chapter
     02), and what decides is the minimum that is reached: so we start at random, several times, and keep the lowest.
 
@@ -76,14 +87,14 @@ def unordered_cameras(X, rank, starts, rng):
     -------
     (F, 3, 2), orthonormal; signs as `consistent` sets them.
     """
-    F, P, _ = X.shape
-    U, s, _ = np.linalg.svd(X.transpose(0, 2, 1).reshape(2 * F, P), full_matrices=False)
+    F = len(X)
+    U, s, _ = np.linalg.svd(stacked(X), full_matrices=False)
     n = min(3 * rank, len(s))
     motion = np.ascontiguousarray((U[:, :n] * np.sqrt(s[:n])).reshape(F, 2, n))
     best = None
     for _ in starts:
         first = np.linalg.qr(rng.normal(size=(n, 3)))[0]
-        found = minimize(_ratio_misfit, first.ravel(), args=(motion,), jac=True, method="BFGS")
+        found = minimize(_ratio_misfit, first.ravel(), args=(motion,), jac=True, method="BFGS", options={"gtol": 1e-8})
         best = found if best is None or found.fun < best.fun else best
     rows = motion @ best.x.reshape(n, 3)  # (F, 2, 3)
     M = nearest_orthonormal(torch.as_tensor(rows.transpose(0, 2, 1).copy())).numpy()
@@ -95,10 +106,26 @@ def _ratio_misfit(g, motion):
     flat = motion.reshape(-1, motion.shape[2])
     r1, r2 = (flat @ g.reshape(-1, 3)).reshape(-1, 2, 3).transpose(1, 0, 2)  # (F, 3) each
     a, b, c = ((u * v).sum(1) for u, v in ((r1, r1), (r2, r2), (r1, r2)))
-    length, angle = 1 - b / a, 2 * c / a
-    da, db, dc = (2 * length * b - 2 * angle * 2 * c) / a**2, -2 * length / a, 4 * angle / a
+    size = a + b
+    length, angle = (a - b) / size, 2 * c / size  # both zero for a camera
+    both = 2 * (length**2 + angle**2) / size
+    da, db, dc = 2 * length / size - both, -2 * length / size - both, 4 * angle / size
     by_rows = np.stack([2 * da[:, None] * r1 + dc[:, None] * r2, 2 * db[:, None] * r2 + dc[:, None] * r1], 1)
     return (length**2).sum() + (angle**2).sum(), (flat.T @ by_rows.reshape(-1, 3)).ravel()
+
+
+def quadratic(a, b):
+    """aᵀ Q b as a linear function of the six entries of a symmetric Q, `symmetric`'s argument: (n, 3) twice, (n, 6)."""
+    i, j = np.triu_indices(3)
+    return np.where(i == j, 0.5, 1) * (a[:, i] * b[:, j] + a[:, j] * b[:, i])
+
+
+def symmetric(q):
+    """The symmetric 3×3 matrix of its six entries on and above the diagonal, row by row."""
+    Q = np.zeros((3, 3))
+    i, j = np.triu_indices(3)
+    Q[i, j] = Q[j, i] = q
+    return Q
 
 
 def continuous(rows):

@@ -9,8 +9,12 @@ function only.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from .images import stacked
 
 _RCOND = 1e-10  # kernels can make columns of C nearly dependent
+_DAMPING = 1e-4, 1e-12, 1e12  # at the start, the least (some directions change nothing), and where nothing is left
 
 
 @dataclass(eq=False)
@@ -74,15 +78,20 @@ def fit(X, M, coefficients, theta, watch, *, sequential=False, tidy=None, iterat
     theta : (n,)
     converged : bool
     """
-    images = X.transpose(0, 2, 1).reshape(-1, X.shape[1])  # (2F, P)
+    images = stacked(X)
     solve = _one_by_one if sequential else _together
     now = coefficients(theta)
     B, Q, P, left = solve(images, now.C, M)
-    best, damping, converged = np.sqrt((left**2).mean()), 1e-4, False
+    best, damping, converged = np.sqrt((left**2).mean()), _DAMPING[0], False
     for _ in watch.steps(iterations, "coefficients"):
         gradient, hessian = _normal_equations(now, M, B, Q, P, left)
-        while damping < 1e12:
-            step = np.linalg.solve(hessian + damping * np.eye(len(hessian)), gradient)
+        value = np.inf
+        while damping < _DAMPING[2]:
+            try:
+                step = cho_solve(cho_factor(hessian + damping * np.eye(len(hessian))), gradient)
+            except LinAlgError:  # not positive, up to rounding
+                damping *= 10
+                continue
             tried = theta + step if tidy is None else tidy(theta + step)
             then = coefficients(tried)
             solved = solve(images, then.C, M)
@@ -92,11 +101,22 @@ def fit(X, M, coefficients, theta, watch, *, sequential=False, tidy=None, iterat
             damping *= 10
         converged = not value < best - tolerance and not watch.over
         if value < best:
-            theta, now, best, damping = tried, then, value, damping / 100
+            theta, now, best, damping = tried, then, value, max(damping / 100, _DAMPING[1])
             B, Q, P, left = solved
         if converged:
             break
     return np.einsum("fk,kip->fpi", now.C, B), theta, converged
+
+
+def linear(basis, rank):
+    """The coefficients C = Ω Z as a function of Z (d · rank,), and where to begin: the first columns of Ω."""
+    F, d = basis.shape
+    local, free = np.broadcast_to(np.eye(rank), (F, rank, rank)), np.zeros((F, rank, 0))
+
+    def coefficients(theta):
+        return Coefficients(basis @ theta.reshape(d, rank), basis, local, free)
+
+    return coefficients, np.eye(d, rank).ravel()
 
 
 def _motion(C, M):

@@ -65,7 +65,10 @@ def load_classic(path):
     arrays = read_npz(path, keys={"S", "S_world", "R"})
     if "S" not in arrays:
         raise KeyError(f"{path}: needs an array S (F, P, 3); it is not there.")
-    S = Landmarks(points3d=arrays["S"]).points3d
+    try:
+        S = Landmarks(points3d=arrays["S"]).points3d
+    except ValueError as error:
+        raise ValueError(f"{path}: S as {error}") from None
     S = S - S.mean(1, keepdims=True)
     if not {"S_world", "R"} <= arrays.keys():
         return Landmarks(S[..., :2], points3d=S, cameras=np.tile(np.eye(3, 2), (len(S), 1, 1)), name=path.stem)

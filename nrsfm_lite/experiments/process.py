@@ -1,19 +1,25 @@
 """A measurement in a process of its own: peak memory never goes down again in an old one."""
 
 import multiprocessing
+import os
 import resource
 import sys
+from pathlib import Path
+from unittest import mock
+
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # read when the libraries load
 
 
-def apart(function, *arguments):
-    """function(*arguments), a module's function, computed in a fresh process.
+def apart(function, *arguments, one_thread=False):
+    """function(*arguments), a module's function, computed in a fresh process, of one thread if wanted.
 
     Raises RuntimeError if that process ends without a result.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     child = context.Process(target=_send, args=(theirs, function, arguments))
-    child.start()
+    with mock.patch.dict(os.environ, dict.fromkeys(_THREADS, "1") if one_thread else {}):
+        child.start()
     theirs.close()
     try:
         return ours.recv()
@@ -25,6 +31,10 @@ def apart(function, *arguments):
 
 def peak_mb():
     """Largest memory that this process has ever held, in megabytes."""
+    status = Path("/proc/self/status")
+    if status.exists():  # getrusage would count what the parent held, too
+        (line,) = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
+        return int(line.split()[1]) / 1e3
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
