@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .. import baselines, cameras, metrics
+from .. import baselines, cameras, metrics, quality
 from ..datasets import make_views
 from ..reconstruction import reconstruct
 from . import material
@@ -50,7 +50,8 @@ def conditions(quick):
         "other_hand": "share of frames, seen by their camera, of the other handedness",
         "image": "norm of the reprojection error over that of the centred images",
         "network": "nl.reconstruct with its defaults: frames in no order, each sequence on its own; the refinement "
-        "learns a prior over shapes from the same 2D points. one pass: the same without the refinement",
+        "learns a prior over shapes from the same 2D points. one_pass: the same without the refinement. surprise: "
+        "−log likelihood of the images under that prior, without truth; among seeds, the lowest is to be preferred",
     }
 
 
@@ -63,8 +64,9 @@ def measure(data, method, seed):
     if name == "network":
         rec = reconstruct(truth.points2d, seed=seed, progress=False)
         plain = reconstruct(truth.points2d, model=rec.model, refine=False)
-        one_pass = metrics.normalized_error(plain.shapes, truth.points3d, scale=False).mean()
-        return _errors(rec, truth, name) | {"one_pass": float(one_pass), "own": ""}
+        one_pass = float(metrics.normalized_error(plain.shapes, truth.points3d, scale=False).mean())
+        surprise = quality.surprise(rec.model, truth.points2d)
+        return _errors(rec, truth, name) | {"one_pass": one_pass, "surprise": surprise, "own": ""}
     own = _own(name, variant, data)
     how = own | ({"seed": seed} if name in _BY_CHANCE else {})
     how |= {} if name in ("tomasi_kanade", "pta") else {"progress": False}
@@ -72,12 +74,21 @@ def measure(data, method, seed):
     if name in _BY_ROUNDING:
         W = W + 1e-12 * np.random.default_rng(seed).normal(size=W.shape)
     rec = getattr(baselines, name)(W, **how)
-    return _errors(rec, truth, name) | {"one_pass": "", "own": " ".join(f"{k}={v}" for k, v in own.items())}
+    return _errors(rec, truth, name) | {
+        "one_pass": "",
+        "surprise": "",
+        "own": " ".join(f"{k}={v}" for k, v in own.items()),
+    }
 
 
 def report(rows):
-    """Mean and spread over seeds, a line per method and sequence."""
-    return material.by_groups(("method", "data"), ("per_frame", "e3d_world", "e3d_camera", "seconds"), rows)
+    """Mean and spread over seeds, a line per method and sequence; and the network that is least surprised."""
+    text = material.by_groups(("method", "data"), ("per_frame", "e3d_world", "e3d_camera", "seconds"), rows)
+    networks = [r for r in rows if r["method"] == "network"]
+    for data in dict.fromkeys(r["data"] for r in networks):
+        chosen = min((r for r in networks if r["data"] == data), key=lambda r: float(r["surprise"]))
+        text += f"\nnetwork of least surprise, data {data}: per_frame {chosen['per_frame']} (seed {chosen['seed']})"
+    return text
 
 
 def _own(method, variant, data):
