@@ -1,8 +1,14 @@
-"""How many CPU threads PyTorch uses, for a while."""
+"""How many CPU threads PyTorch and NumPy use, for a while."""
 
 from contextlib import contextmanager
 
+import scipy.linalg  # noqa: F401, so that SciPy's own linear algebra is there to be found, too
 import torch
+from threadpoolctl import ThreadpoolController
+
+# A decorator: while the function runs, linear algebra takes one thread. On many small matrices a second one costs
+# more than it gives, and on a busy machine ten times as much.
+one_thread = ThreadpoolController().wrap(limits=1)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from ..threads import one_thread
 from .images import read
 from .limits import Watch, check_cost, check_whole
 from .upgrade import unordered_cameras
@@ -12,6 +13,7 @@ _TOLERANCE = 1e-5  # relative change of the shapes at which a level ends
 _ITERATIONS = 5000  # at most, per level
 
 
+@one_thread
 def bmm(W, visible=None, rank=None, restarts=10, max_seconds=None, progress=True, seed=0):
     """Cameras from a low-rank factorisation; then, of all shapes that fit the images, those of least nuclear norm.
 

@@ -8,7 +8,7 @@ import torch
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from ..threads import use_threads
+from ..threads import one_thread, use_threads
 from .images import read
 from .limits import Watch, check_cost, check_whole
 from .weak import weak_depths
@@ -21,6 +21,7 @@ _GAP = 1e-10  # squared distance per frame at which the consensus ends
 _STEPS = 10_000
 
 
+@one_thread
 def cns(W, visible=None, group_size=10, groups_per_point=50, locality=0.1, max_seconds=None, progress=True, seed=0):
     """Depths of many small groups of points, each by low rank, and the shape that most of them agree on.
 

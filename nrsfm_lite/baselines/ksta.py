@@ -4,6 +4,7 @@ import numpy as np
 from scipy.fft import idct
 from scipy.spatial.distance import cdist, pdist
 
+from ..threads import one_thread
 from .images import read
 from .limits import Watch, check_cost, check_whole
 from .upgrade import trajectory_cameras
@@ -13,6 +14,7 @@ _RANK = 8  # where the points allow it
 _PAIRS = 2000  # frames, drawn evenly, whose distances give the kernel its width
 
 
+@one_thread
 def ksta(W, visible=None, rank=None, smoothness=0.1, dimensions=None, max_seconds=None, progress=True):
     """A point wanders smoothly through few dimensions, and the shape is a smooth function of where it is.
 

@@ -7,6 +7,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from ..cameras import rotations
+from ..threads import one_thread
 from .images import read
 from .limits import Watch, check_cost, check_whole
 from .rigid import tomasi_kanade
@@ -57,6 +58,7 @@ class _State:
         return np.tensordot(self.weights, self.atoms, 1)
 
 
+@one_thread
 def nlo(W, visible=None, rank=3, prior=1e-2, mean_prior=1e-3, max_seconds=None, progress=True):
     """Cameras, weights and atoms together, by bundle adjustment from a rigid start.
 

@@ -3,11 +3,13 @@
 import numpy as np
 from scipy.fft import idct
 
+from ..threads import one_thread
 from .images import read, stacked
 from .limits import check_whole
 from .upgrade import trajectory_cameras
 
 
+@one_thread
 def pta(W, visible=None, rank=12):
     """Smooth trajectories: the shape's change over time is a sum of `rank` discrete cosines.
 

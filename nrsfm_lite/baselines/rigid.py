@@ -4,12 +4,14 @@ import numpy as np
 import torch
 
 from ..cameras import nearest_orthonormal
+from ..threads import one_thread
 from .images import read, stacked
 from .upgrade import quadratic, symmetric
 
 _UNSEEN = 1e-4  # share of its images that a direction must have
 
 
+@one_thread
 def tomasi_kanade(W, visible=None):
     """One rigid shape for all images, and a camera per frame, as if nothing moved.
 

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from ..threads import use_threads
+from ..threads import one_thread, use_threads
 from .images import read, stacked
 from .limits import Watch, check_cost, check_whole
 from .upgrade import trajectory_cameras
@@ -14,6 +14,7 @@ _RANK = 7  # where the points allow it
 _ENERGY = 0.99  # of the kernel's spectrum, that the basis keeps
 
 
+@one_thread
 def riks(W, visible=None, rank=None, basis=0.2, kernel="asfm", max_seconds=None, progress=True):
     """As column space fitting, but coefficients are smooth over *likeness of images* instead of time.
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..threads import one_thread
 from .images import read
 from .limits import Watch, check_cost, check_whole
 from .upgrade import quadratic, symmetric
@@ -29,6 +30,7 @@ class _State:
     to_B: np.ndarray  # multipliers of A = B
 
 
+@one_thread
 def sfc(
     W, visible=None, rank=5, penalty=0.05, restarts=1, upgrade=False, max_seconds=None, progress=True, seed=0
 ):  # fmt: skip

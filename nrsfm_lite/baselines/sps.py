@@ -4,6 +4,7 @@ import numpy as np
 import torch
 
 from ..cameras import nearest_orthonormal, rotations
+from ..threads import one_thread
 from .block_ksvd import learn_atoms
 from .images import read
 from .limits import Watch, check_cost, check_whole
@@ -17,6 +18,7 @@ _TRIALS = 200  # frames tried as the hypothesis that turns one atom into another
 _GOOD = 1e-4  # relative reprojection error that makes further starts needless
 
 
+@one_thread
 def sps(W, visible=None, atoms=10, active=2, restarts=5, max_seconds=None, progress=True, seed=0):
     """Every shape is the sum of few atoms out of many, and nothing else is assumed.
 
