@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 _SHARE = 0.8  # of the free memory that a method may take
 LONG = 3600  # seconds that nobody is made to wait unasked
