@@ -27,9 +27,8 @@ def ksta(W, visible=None, rank=None, smoothness=0.1, dimensions=None, max_second
     steps for each of the two stages; memory O(F · rank² · P + (dq)²). Their published form holds a Jacobian of
     2FP × dq numbers; ours does not, but d grows with F, so time grows with F³.
 
-    Assumes orthographic views in *temporal order* from a slowly moving camera. The last steps wander along a flat
-    valley of the objective: rounding alone can change the error on a classic sequence by a few per cent, and with too
-    high a rank by much more.
+    Assumes orthographic views in *temporal order* from a slowly moving camera.
+    With too high a rank, depths explode while the images fit ever better.
 
     Parameters
     ----------

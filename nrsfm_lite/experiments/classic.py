@@ -41,7 +41,7 @@ def conditions(quick):
     """What all cases share."""
     return {
         "own": "the method's own parameters; all others are its defaults",
-        "seed": "of the method; of ksta, which has none, of noise of 1e-12 in the images: rounding changes it",
+        "seed": "of the method; of ksta, which has none, of noise of 1e-12 in the images: does rounding change it?",
         "per_frame": "convention (a): normalised error, each frame rotated or reflected at its best, no scale fitted",
         "e3d_world": "convention (b), one rotation for all frames: shapes in the world; empty where the method has no "
         "world frame, or the world of the sequence is not known",
