@@ -1,14 +1,27 @@
 """How many CPU threads PyTorch and NumPy use, for a while."""
 
 from contextlib import contextmanager
+from functools import wraps
 
 import scipy.linalg  # noqa: F401, so that SciPy's own linear algebra is there to be found, too
 import torch
 from threadpoolctl import ThreadpoolController
 
-# A decorator: while the function runs, linear algebra takes one thread. On many small matrices a second one costs
-# more than it gives, and on a busy machine ten times as much.
-one_thread = ThreadpoolController().wrap(limits=1)
+_LIBRARIES = ThreadpoolController()
+
+
+def one_thread(function):
+    """A decorator: PyTorch and the linear algebra of NumPy and SciPy take one thread while the function runs.
+
+    On many small matrices a second one costs more than it gives, and on a busy machine ten times as much.
+    """
+
+    @wraps(function)
+    def alone(*arguments, **named):
+        with use_threads(1), _LIBRARIES.limit(limits=1):
+            return function(*arguments, **named)
+
+    return alone
 
 
 @contextmanager

@@ -4,7 +4,7 @@ import numpy as np
 
 from ..threads import one_thread
 from .images import read
-from .limits import Watch, check_cost, check_whole
+from .limits import Watch, check_cost, check_whole, choose_rank
 from .upgrade import unordered_cameras
 
 _LEVELS = 20  # of the weight μ, each a quarter of the one before
@@ -60,9 +60,7 @@ def bmm(W, visible=None, rank=None, restarts=10, max_seconds=None, progress=True
     """
     images = read(W, visible, frames=4, points=6, method="bmm")
     F, P, _ = images.X.shape
-    most = min(P, 2 * F) // 3
-    rank = min(10, most) if rank is None else rank
-    check_whole("rank", rank, 2, most, f" for {F} frames and {P} points")
+    rank = choose_rank(rank, 10, 2, F, P)
     check_whole("restarts", restarts, 1, 1000)
     check_cost("bmm", F, 8 * (80 * F * P + 5 * (3 * P) ** 2) / 2**30, 3.5e-6 * F * P**2 + 2e-6 * P**3, max_seconds)
     watch = Watch("bmm", max_seconds, progress)

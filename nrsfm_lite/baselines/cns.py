@@ -8,7 +8,7 @@ import torch
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from ..threads import one_thread, use_threads
+from ..threads import one_thread
 from .images import read
 from .limits import Watch, check_cost, check_whole
 from .weak import weak_depths
@@ -87,8 +87,7 @@ def cns(W, visible=None, group_size=10, groups_per_point=50, locality=0.1, max_s
     numbers = 48 / 8 * F * m * n + 3 * (P + m) ** 2
     check_cost("cns", F, 8 * numbers / 2**30, m * (0.03 + 2.4e-4 * F), max_seconds, "Fewer groups_per_point cost less.")
     groups = sample_groups(images.X, n, groups_per_point, locality, np.random.default_rng(seed))
-    with use_threads(1):
-        depths, finished = _depths(images.X, groups, watch)
+    depths, finished = _depths(images.X, groups, watch)
     groups = groups[: len(depths)]
     depths *= group_signs(depths, groups)[:, None, None]
     z = consensus(depths, groups)

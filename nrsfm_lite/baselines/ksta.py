@@ -6,11 +6,10 @@ from scipy.spatial.distance import cdist, pdist
 
 from ..threads import one_thread
 from .images import read
-from .limits import Watch, check_cost, check_whole
+from .limits import Watch, check_cost, check_share, check_whole, choose_rank
 from .upgrade import trajectory_cameras
 from .variable_projection import Coefficients, fit, linear
 
-_RANK = 8  # where the points allow it
 _PAIRS = 2000  # frames, drawn evenly, whose distances give the kernel its width
 
 
@@ -65,13 +64,10 @@ def ksta(W, visible=None, rank=None, smoothness=0.1, dimensions=None, max_second
     """
     images = read(W, visible, frames=6, points=6, method="ksta")
     F, P, _ = images.X.shape
-    most = min(P, 2 * F) // 3
-    rank = min(_RANK, most) if rank is None else rank
-    check_whole("rank", rank, 2, most, f" for {F} frames and {P} points")
+    rank = choose_rank(rank, 8, 2, F, P)
     dimensions = min(3, rank - 1) if dimensions is None else dimensions
     check_whole("dimensions", dimensions, 1, rank - 1, ", less than the rank")
-    if not 0 < smoothness <= 1:
-        raise ValueError(f"smoothness={smoothness}; expected a share of the frames, above 0 and at most 1.")
+    check_share("smoothness", smoothness)
     d = max(rank, round(smoothness * F))
     check_cost("ksta", F, *_cost(F, P, d, rank), max_seconds, "A smaller smoothness takes fewer cosines.")
     watch = Watch("ksta", max_seconds, progress)
@@ -90,8 +86,7 @@ def _linear(X, M, cosines, rank, watch):
     def orthonormal(theta):  # the atoms undo any change of basis
         return np.linalg.qr(theta.reshape(-1, rank))[0].ravel()
 
-    S, _, done = fit(X, M, coefficients, start, watch, tidy=orthonormal)
-    return S, done
+    return fit(X, M, coefficients, start, watch, tidy=orthonormal)
 
 
 def _main_directions(S, q):
@@ -115,8 +110,7 @@ def _curved(X, M, cosines, y, rank, watch):
         return Coefficients(C, cosines, local, free)
 
     start = np.concatenate([(cosines.T @ y).ravel(), _spread_out(y, rank).ravel()])
-    S, _, done = fit(X, M, coefficients, start, watch)
-    return S, done
+    return fit(X, M, coefficients, start, watch)
 
 
 def _spread_out(y, n):

@@ -82,6 +82,20 @@ def check_whole(name, value, least, most, circumstance=""):
         raise ValueError(f"{name}={value}; expected a whole number, {least} … {most}{circumstance}.")
 
 
+def choose_rank(rank, usual, least, frames, points):
+    """The user's rank, checked, or the usual one; three components per atom fit into `points` and 2 · `frames`."""
+    most = min(points, 2 * frames) // 3
+    rank = min(usual, most) if rank is None else rank
+    check_whole("rank", rank, least, most, f" for {frames} frames and {points} points")
+    return rank
+
+
+def check_share(name, value):
+    """Raise ValueError unless a parameter is a share of the frames."""
+    if not 0 < value <= 1:
+        raise ValueError(f"{name}={value}; expected a share of the frames, above 0 and at most 1.")
+
+
 def _free_bytes():
     """Memory that is free, inside a container also by its own limit."""
     free = psutil.virtual_memory().available

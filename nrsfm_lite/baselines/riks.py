@@ -3,14 +3,13 @@
 import numpy as np
 import torch
 
-from ..threads import one_thread, use_threads
+from ..threads import one_thread
 from .images import read, stacked
-from .limits import Watch, check_cost, check_whole
+from .limits import Watch, check_cost, check_share, choose_rank
 from .upgrade import trajectory_cameras
 from .variable_projection import fit, linear
 
 KERNELS = ("asfm", "rik")
-_RANK = 7  # where the points allow it
 _ENERGY = 0.99  # of the kernel's spectrum, that the basis keeps
 
 
@@ -63,11 +62,8 @@ def riks(W, visible=None, rank=None, basis=0.2, kernel="asfm", max_seconds=None,
     """
     images = read(W, visible, frames=6, points=6, method="riks")
     F, P, _ = images.X.shape
-    most = min(P, 2 * F) // 3
-    rank = min(_RANK, most) if rank is None else rank
-    check_whole("rank", rank, 1, most, f" for {F} frames and {P} points")
-    if not 0 < basis <= 1:
-        raise ValueError(f"basis={basis}; expected a share of the frames, above 0 and at most 1.")
+    rank = choose_rank(rank, 7, 1, F, P)
+    check_share("basis", basis)
     if kernel not in KERNELS:
         raise ValueError(f"kernel={kernel!r}; expected one of {', '.join(KERNELS)}.")
     d = max(rank, round(basis * F))
@@ -77,7 +73,7 @@ def riks(W, visible=None, rank=None, basis=0.2, kernel="asfm", max_seconds=None,
     distances = _unlike_in_space(images.X) if kernel == "asfm" else _unlike_in_the_plane(images.X)
     components = _components(distances, d, watch)
     coefficients, start = linear(components, rank)
-    S, _, done = fit(images.X, M, coefficients, start, watch, sequential=True, iterations=300, tolerance=1e-9)
+    S, done = fit(images.X, M, coefficients, start, watch, sequential=True, iterations=300, tolerance=1e-9)
     return images.reconstruction(S, M, "riks", done)
 
 
@@ -95,11 +91,10 @@ def _unlike_in_space(X):
     products = torch.as_tensor(rows @ rows.T).view(F, 2, F, 2).transpose(1, 2)  # (F, F, 2, 2)
     own = products.diagonal().permute(2, 0, 1)  # (F, 2, 2), each image with itself
     E = torch.empty(F, F, dtype=torch.float64)
-    with use_threads(1):
-        for f in range(F):  # row by row: F² matrices of 4×4 would not fit
-            mine, cross = own[f].expand(F, 2, 2), products[f]
-            gram = torch.cat([torch.cat([mine, cross], 2), torch.cat([cross.mT, own], 2)], 1)
-            E[f] = torch.linalg.eigvalsh(gram)[:, 0].clamp(min=0)
+    for f in range(F):  # row by row: F² matrices of 4×4 would not fit
+        mine, cross = own[f].expand(F, 2, 2), products[f]
+        gram = torch.cat([torch.cat([mine, cross], 2), torch.cat([cross.mT, own], 2)], 1)
+        E[f] = torch.linalg.eigvalsh(gram)[:, 0].clamp(min=0)
     return ((E + E.T) / 2).numpy()
 
 

@@ -73,8 +73,8 @@ def unordered_cameras(X, rank, starts, rng):
     length: the sum over frames of ((a − b)² + 4 c²) / (a + b)², with a = ‖r₁‖², b = ‖r₂‖², c = r₁·r₂, is minimised
     over 3·rank components. (The authors divide by a² instead, with the same minima on the classic sequences; but then
     one frame whose points lie on a vertical line spoils all cameras.)
-    Dai et al. (2014) start from a semidefinite programme. That start is poor (baselines are compared in chapter
-    02), and what decides is the minimum that is reached: so we start at random, several times, and keep the lowest.
+    Dai et al. (2014) start from a semidefinite programme. That start is poor, and what decides is the minimum that is
+    reached: so we start at random, several times, and keep the lowest.
 
     Parameters
     ----------
@@ -158,7 +158,8 @@ def consistent(M, X):
     sign = np.sign(laid @ np.linalg.eigh(laid.T @ laid)[1][:, -1])
     sign[sign == 0] = 1
     for _ in range(len(X)):
-        wrong = (laid * sign[:, None]) @ (laid * sign[:, None]).mean(0) < 0
+        signed = laid * sign[:, None]
+        wrong = signed @ signed.mean(0) < 0
         if not wrong.any():
             break
         sign[wrong] *= -1

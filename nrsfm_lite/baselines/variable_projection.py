@@ -75,7 +75,6 @@ def fit(X, M, coefficients, theta, watch, *, sequential=False, tidy=None, iterat
     Returns
     -------
     S : (F, P, 3) shapes
-    theta : (n,)
     converged : bool
     """
     images = stacked(X)
@@ -105,7 +104,7 @@ def fit(X, M, coefficients, theta, watch, *, sequential=False, tidy=None, iterat
             B, Q, P, left = solved
         if converged:
             break
-    return np.einsum("fk,kip->fpi", now.C, B), theta, converged
+    return np.einsum("fk,kip->fpi", now.C, B), converged
 
 
 def linear(basis, rank):
