@@ -11,12 +11,12 @@ from . import baselines, cameras, datasets, experiments, metrics, plotting, qual
 from .data import Landmarks, Reconstruction
 from .model import Config, DeepNRSfM
 from .reconstruction import reconstruct
-from .training import fit
+from .training import Schedule, fit
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Config", "DeepNRSfM", "Landmarks", "Reconstruction", "baselines", "cameras", "datasets",
+    "Config", "DeepNRSfM", "Landmarks", "Reconstruction", "Schedule", "baselines", "cameras", "datasets",
     "experiments", "fit", "metrics", "plotting", "quality", "reconstruct",
     "sparse_coding",
 ]  # fmt: skip
