@@ -189,7 +189,7 @@ def infer(
     image, X, unit = model.normalizer.normalize(W, mean, weight)
     with torch.no_grad():
         psi, S, M = model.lift(image)
-    if isinstance(how, tuple):
+    if how is not None and not isinstance(how, str):
         S, M = shape_prior.apply(how, X.cpu(), weight.cpu(), M.cpu())
     elif how == "code":
         psi, M = _refine_code(model, X.to(model.dtype), weight, psi, M)
