@@ -4,23 +4,37 @@
 method made of them. Both are plain dataclasses of NumPy arrays and are saved without pickle.
 """
 
+from __future__ import annotations
+
 import json
 import zipfile
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Collection
+from dataclasses import KW_ONLY, dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from . import checks
+
 # The per-frame arrays of Landmarks: name -> (shape with F frames and P points, dtype).
 _FRAME_ARRAYS = {
-    "points2d": ("F", "P", 2),
-    "visible": ("F", "P"),
-    "confidence": ("F", "P"),
-    "points3d": ("F", "P", 3),
-    "cameras": ("F", 3, 2),
-    "translations": ("F", 2),
-    "sequence": ("F",),
+    "points2d": (("F", "P", 2), float),
+    "visible": (("F", "P"), bool),
+    "confidence": (("F", "P"), float),
+    "points3d": (("F", "P", 3), float),
+    "cameras": (("F", 3, 2), float),
+    "translations": (("F", 2), float),
+    "sequence": (("F",), int),
 }
+
+# (config, weights) -> network. Set by `model`, the only module that knows how a network is built, so that this
+# one, at the bottom of the package, needs to know no network.
+network_from_arrays: Callable[[dict, dict[str, np.ndarray]], Any] | None = None
+
+
+def _no_edges() -> np.ndarray:
+    return np.zeros((0, 2), int)
 
 
 @dataclass(eq=False)
@@ -34,11 +48,13 @@ class Landmarks:
     visible : (F, P) bool
         False where a point is missing. Default: everything is visible.
     confidence : (F, P) float or None
+        From 0 to 1, how far to trust a visible point.
     points3d : (F, P, 3) float or None
         The true shapes. Only for evaluation and for making views.
     cameras : (F, 3, 2) float or None
         The true cameras, orthonormal columns; ``points2d = points3d @ camera + translation``.
     translations : (F, 2) float or None
+        In the units of points2d.
     sequence : (F,) int
         Which motion or file a frame comes from. Default: all from one.
     names : tuple of P str
@@ -55,16 +71,17 @@ class Landmarks:
 
     points2d: np.ndarray | None = None
     visible: np.ndarray | None = None
+    _: KW_ONLY
     confidence: np.ndarray | None = None
     points3d: np.ndarray | None = None
     cameras: np.ndarray | None = None
     translations: np.ndarray | None = None
     sequence: np.ndarray | None = None
-    names: tuple = ()
-    edges: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
+    names: tuple[str, ...] = ()
+    edges: np.ndarray = field(default_factory=_no_edges)
     name: str = "landmarks"
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         first = self.points2d if self.points2d is not None else self.points3d
         if first is None:
             raise ValueError("Landmarks needs points2d (F, P, 2) or points3d (F, P, 3); got neither.")
@@ -75,41 +92,44 @@ class Landmarks:
             self.visible = np.ones((n_frames, n_points), bool)
         if self.sequence is None:
             self.sequence = np.zeros(n_frames, int)
-        for key, axes in _FRAME_ARRAYS.items():
+        for key, (axes, dtype) in _FRAME_ARRAYS.items():
             value = getattr(self, key)
             if value is None:
                 continue
-            expected = tuple({"F": n_frames, "P": n_points}.get(a, a) for a in axes)
-            value = _as_array(key, value, {"visible": bool, "sequence": int}.get(key, float))
-            if value.shape != expected:
-                raise ValueError(f"{key} has shape {value.shape}; expected {expected}.")
+            value = checks.as_array(key, value, dtype)
+            checks.check_shape(key, value, tuple({"F": n_frames, "P": n_points}.get(a, a) for a in axes))
             setattr(self, key, value)
         if self.points2d is not None:
-            check_visible_finite("points2d", self.points2d, self.visible)
-        if self.points3d is not None and not np.isfinite(self.points3d).all():
-            raise ValueError("points3d has values that are not finite numbers.")
+            checks.check_visible_finite("points2d", self.points2d, self.visible)
+        if self.points3d is not None:
+            checks.check_finite("points3d", self.points3d)
         self.names, self.edges = _names_and_edges(self.names, self.edges, n_points)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.visible)
 
     @property
-    def n_points(self):
+    def n_points(self) -> int:
         """P, the number of points."""
         return self.visible.shape[1]
 
-    def __getitem__(self, frames):
+    def __getitem__(self, frames: Any) -> Landmarks:
         """The same landmarks with only some frames: a slice, indices or a boolean mask."""
         if isinstance(frames, (int, np.integer)):
             frames = [frames]
         chosen = {key: None if getattr(self, key) is None else getattr(self, key)[frames] for key in _FRAME_ARRAYS}
         return Landmarks(**chosen, names=self.names, edges=self.edges, name=self.name)
 
-    def split(self, test=0.2):
+    def split(self, test: float = 0.2) -> tuple[Landmarks, Landmarks]:
         """(train, test) by whole sequences: the last max(1, round(test · n)) sequences are the test.
 
         Raises ValueError with fewer than two sequences, or if nothing is left to train on.
+
+        >>> train, test = nl.datasets.make_motion(1000).split()
+        >>> len(train), len(test)
+        (800, 200)
         """
+        test = checks.at_least("test", test)
         ids = np.unique(self.sequence)
         n_test = max(1, round(test * len(ids)))
         if n_test >= len(ids):
@@ -117,7 +137,7 @@ class Landmarks:
         unseen = np.isin(self.sequence, ids[-n_test:])
         return self[~unseen], self[unseen]
 
-    def save(self, path):
+    def save(self, path: str | Path) -> Path:
         """Write an .npz that `datasets.load_npz` reads; returns its path (the ending is added if missing)."""
         arrays = {key: getattr(self, key) for key in _FRAME_ARRAYS if getattr(self, key) is not None}
         path = _npz(path)
@@ -149,21 +169,27 @@ class Reconstruction:
         for a given number of steps and is always done.
     model : DeepNRSfM or None
         The trained network, to be used again on new frames.
+
+    Raises
+    ------
+    ValueError
+        If a shape does not fit.
     """
 
     shapes: np.ndarray
     cameras: np.ndarray
     translations: np.ndarray | None = None
+    _: KW_ONLY
     visible: np.ndarray | None = None
-    names: tuple = ()
-    edges: np.ndarray = field(default_factory=lambda: np.zeros((0, 2), int))
+    names: tuple[str, ...] = ()
+    edges: np.ndarray = field(default_factory=_no_edges)
     coherence: float | None = None
     method: str = ""
     converged: bool = True
-    model: object = None
+    model: Any = None
 
-    def __post_init__(self):
-        self.shapes = _as_array("shapes", self.shapes, float)
+    def __post_init__(self) -> None:
+        self.shapes = checks.as_array("shapes", self.shapes, float)
         if self.shapes.ndim != 3 or self.shapes.shape[2] != 3:
             raise ValueError(f"shapes has shape {self.shapes.shape}; expected (F, P, 3).")
         n_frames, n_points = self.shapes.shape[:2]
@@ -176,21 +202,20 @@ class Reconstruction:
             ("translations", float, (n_frames, 2)),
             ("visible", bool, (n_frames, n_points)),
         ]:
-            value = _as_array(key, getattr(self, key), dtype)
-            if value.shape != expected:
-                raise ValueError(f"{key} has shape {value.shape}; expected {expected}.")
+            value = checks.as_array(key, getattr(self, key), dtype)
+            checks.check_shape(key, value, expected)
             setattr(self, key, value)
         self.names, self.edges = _names_and_edges(self.names, self.edges, n_points)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.shapes)
 
     @property
-    def projections(self):
+    def projections(self) -> np.ndarray:
         """(F, P, 2), the shapes seen by their cameras, in the units of the input."""
         return self.shapes @ self.cameras + self.translations[:, None]
 
-    def save(self, path):
+    def save(self, path: str | Path) -> Path:
         """Write everything, the network's weights included, to one .npz without pickle; returns its path."""
         arrays = {}
         if self.model is not None:
@@ -205,30 +230,29 @@ class Reconstruction:
         return path
 
     @classmethod
-    def load(cls, path):
-        """Read what `save` wrote.
+    def load(cls, path: str | Path) -> Reconstruction:
+        """Read what `save` wrote; the ending .npz may be left out.
 
-        Raises FileNotFoundError if there is no such file, ValueError if it is not a reconstruction.
+        Raises FileNotFoundError if there is no such file, ValueError if it is not a reconstruction, or if the
+        network in it cannot be built.
         """
         path = Path(path) if Path(path).is_file() else _npz(path)
         arrays = read_npz(path)
         if not {"shapes", "cameras"} <= arrays.keys():
             raise ValueError(f"{path}: not a saved reconstruction (it has {', '.join(sorted(arrays)) or 'nothing'}).")
         values = {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
-        for key in {"coherence", "method", "converged"} & values.keys():
-            values[key] = values[key].item()
-        values["names"] = tuple(values.get("names", ()))
         if "config" in arrays:
-            # Imported here: this module is the bottom of the package, and only a saved network
-            # has to know how a network is built.
-            from .model import DeepNRSfM
-
             weights = {k.removeprefix("model/"): v for k, v in arrays.items() if k.startswith("model/")}
             try:
-                values["model"] = DeepNRSfM.from_arrays(json.loads(arrays["config"].item()), weights)
-            except (ValueError, TypeError, RuntimeError):
+                values["model"] = network_from_arrays(json.loads(arrays["config"].item()), weights)
+            except Exception:  # a network with a part missing, or of another version, can fail in any way
                 raise ValueError(f"{path}: the network in it is incomplete or of another version.") from None
-        return cls(**values)
+        try:
+            for key in {"coherence", "method", "converged"} & values.keys():
+                values[key] = values[key].item()
+            return cls(**values)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
 
 def as_points(W, visible=None):
@@ -320,7 +344,7 @@ def check_visible_finite(key, points, visible):
         )
 
 
-def read_npz(path, keys=None):
+def read_npz(path: str | Path, keys: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """The arrays of an .npz file as a dict, never unpickling; only those named in `keys`, if given.
 
     Raises FileNotFoundError if there is no such file, ValueError if it is empty or broken, or if an
@@ -340,33 +364,17 @@ def read_npz(path, keys=None):
         raise ValueError(f"{path}: could not be read as .npz ({error}).") from None
 
 
-def _as_array(key, value, dtype):
-    """A copy of value as an array of float, int or bool; a mask must hold truth values or 0 and 1."""
-    if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()
-    try:
-        array = np.array(value, dtype)
-        if dtype is bool and not np.array_equal(np.asarray(value, float), array):
-            raise ValueError
-    except (TypeError, ValueError):
-        raise ValueError(f"{key} cannot be read as an array of {dtype.__name__}.") from None
-    return array
+_as_array = checks.as_array
 
 
-def _names_and_edges(names, edges, n_points):
-    names = tuple(str(n) for n in names) or tuple(f"point_{i}" for i in range(n_points))
+def _names_and_edges(names: Any, edges: Any, n_points: int) -> tuple[tuple[str, ...], np.ndarray]:
+    names = () if names is None else tuple(str(n) for n in names)
+    names = names or tuple(f"point_{i}" for i in range(n_points))
     if len(names) != n_points:
         raise ValueError(f"names has {len(names)} entries for {n_points} points.")
-    edges = _as_array("edges", edges, int)
-    if edges.size == 0:
-        return names, edges.reshape(0, 2)
-    if edges.ndim != 2 or edges.shape[1] != 2:
-        raise ValueError(f"edges has shape {edges.shape}; expected (E, 2).")
-    if edges.min() < 0 or edges.max() >= n_points:
-        raise ValueError(f"edges refers to a point outside 0 … {n_points - 1}.")
-    return names, edges
+    return names, checks.as_edges("edges", edges, n_points)
 
 
-def _npz(path):
+def _npz(path: str | Path) -> Path:
     path = Path(path)
     return path if path.suffix == ".npz" else path.with_name(path.name + ".npz")

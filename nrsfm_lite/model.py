@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from . import completion, preprocessing
+from . import completion, data, preprocessing
 from .cameras import nearest_orthonormal
 from .shape_prior import KINDS, Gaussian
 from .sparse_coding import mutual_coherence
@@ -330,3 +330,6 @@ class DeepNRSfM(nn.Module):
         older = {k: v for k, v in net.state_dict().items() if k.startswith(("prior_", "origin", "image_"))}
         net.load_state_dict(older | weights)
         return net.eval()
+
+
+data.network_from_arrays = DeepNRSfM.from_arrays

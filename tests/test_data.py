@@ -1,10 +1,14 @@
 """Landmarks and Reconstruction: their checks, their frames, their files."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 import nrsfm_lite as nl
+from nrsfm_lite import data
 
 
 @pytest.fixture
@@ -121,6 +125,65 @@ def test_a_reconstruction_with_half_a_network_is_refused(rng, tmp_path):
     np.savez(file, **arrays)
     with pytest.raises(ValueError, match="the network in it is incomplete"):
         nl.Reconstruction.load(file)
+
+
+@pytest.mark.parametrize("part", ["scale", "gamma", "D.0", "*"])
+def test_a_network_without_a_part_is_refused_in_words(rng, tmp_path, part):
+    net = nl.DeepNRSfM(nl.Config(5, n_dictionaries=3, first_atoms=8, last_atoms=3))
+    file = nl.reconstruct(rng.normal(size=(4, 5, 2)), model=net).save(tmp_path / "r")
+    arrays = dict(np.load(file))
+    for key in [k for k in arrays if k == f"model/{part}" or (part == "*" and k.startswith("model/"))]:
+        del arrays[key]
+    np.savez(file, **arrays)
+    with pytest.raises(ValueError, match=r"r\.npz: the network in it is incomplete or of another version"):
+        nl.Reconstruction.load(file)
+
+
+def test_data_knows_no_network(rng, tmp_path, monkeypatch):
+    """The module is the bottom of the package: who knows how a network is built tells it so."""
+    net = nl.DeepNRSfM(nl.Config(5, n_dictionaries=3, first_atoms=8, last_atoms=3))
+    file = nl.reconstruct(rng.normal(size=(4, 5, 2)), model=net).save(tmp_path / "r")
+    monkeypatch.setattr(data, "network_from_arrays", lambda config, weights: (config["n_points"], len(weights)))
+    assert nl.Reconstruction.load(file).model == (5, len(net.state_dict()))
+    monkeypatch.setattr(data, "network_from_arrays", None)
+    with pytest.raises(ValueError, match="the network in it"):
+        nl.Reconstruction.load(file)
+
+
+def test_the_bottom_of_the_package_imports_only_checks():
+    for name in ("data", "sparse_coding", "cameras", "metrics"):
+        source = Path(data.__file__).with_name(f"{name}.py").read_text()
+        own = set(re.findall(r"from \.(\w+) import", source)) | set(re.findall(r"from \. import (.+)", source))
+        assert own <= {"checks"}, name
+
+
+def test_broken_fields_of_a_file_are_refused_with_its_name(rng, tmp_path):
+    file = nl.Reconstruction(rng.normal(size=(3, 5, 3)), nl.cameras.random_cameras(3)).save(tmp_path / "r")
+    arrays = dict(np.load(file))
+    for key, wrong in [("coherence", np.zeros(2)), ("translations", np.zeros((2, 2)))]:
+        np.savez(file, **arrays | {key: wrong})
+        with pytest.raises(ValueError, match=r"r\.npz"):
+            nl.Reconstruction.load(file)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"edges": [(0.9, 1)]}, "edges cannot be read as an array of whole numbers"),
+        ({"sequence": [0, 0.5, 1]}, "sequence cannot be read as an array of whole numbers"),
+        ({"sequence": [0, np.nan, 1]}, "sequence cannot be read as an array of whole numbers"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_numbers_are_not_cut_to_whole_ones(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        nl.Landmarks(points2d=np.zeros((3, 4, 2)), **wrong)
+    assert nl.Landmarks(points2d=np.zeros((3, 4, 2)), edges=[(0.0, 1.0)]).edges.tolist() == [[0, 1]]
+
+
+def test_split_takes_a_share(landmarks):
+    with pytest.raises(ValueError, match="test=nan"):
+        landmarks.split(np.nan)
 
 
 def test_landmarks_compare_as_objects(landmarks):
