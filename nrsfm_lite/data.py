@@ -236,7 +236,7 @@ class Reconstruction:
         Raises FileNotFoundError if there is no such file, ValueError if it is not a reconstruction, or if the
         network in it cannot be built.
         """
-        path = Path(path) if Path(path).is_file() else _npz(path)
+        path = find_npz(path)
         arrays = read_npz(path)
         if not {"shapes", "cameras"} <= arrays.keys():
             raise ValueError(f"{path}: not a saved reconstruction (it has {', '.join(sorted(arrays)) or 'nothing'}).")
@@ -342,6 +342,11 @@ def check_visible_finite(key, points, visible):
             f"{key} has {int(bad.sum())} visible points that are NaN or infinite (the first in frame {frame}); "
             "mark missing points as False in visible."
         )
+
+
+def find_npz(path: str | Path) -> Path:
+    """The file of that name, or else the one with the ending .npz, which `save` adds."""
+    return Path(path) if Path(path).is_file() else _npz(path)
 
 
 def read_npz(path: str | Path, keys: Collection[str] | None = None) -> dict[str, np.ndarray]:

@@ -166,6 +166,15 @@ def test_broken_fields_of_a_file_are_refused_with_its_name(rng, tmp_path):
             nl.Reconstruction.load(file)
 
 
+def test_the_ending_may_be_left_out_of_every_npz(landmarks, rng, tmp_path):
+    landmarks.save(tmp_path / "walk")
+    assert nl.datasets.load_npz(tmp_path / "walk").name == landmarks.name
+    np.savez(tmp_path / "classic.npz", S=rng.normal(size=(3, 5, 3)))
+    assert nl.datasets.load_classic(tmp_path / "classic").name == "classic"
+    with pytest.raises(FileNotFoundError, match=r"none\.npz: no such file"):
+        nl.datasets.load_npz(tmp_path / "none")
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
