@@ -26,6 +26,7 @@ _FRAME_ARRAYS = {
     "cameras": (("F", 3, 2), float),
     "translations": (("F", 2), float),
     "sequence": (("F",), int),
+    "time": (("F",), float),
 }
 
 # (config, weights) -> network. Set by `model`, the only module that knows how a network is built, so that this
@@ -57,6 +58,8 @@ class Landmarks:
         In the units of points2d.
     sequence : (F,) int
         Which motion or file a frame comes from. Default: all from one.
+    time : (F,) float or None
+        In seconds from the beginning of the sequence; frames may be missing.
     names : tuple of P str
     edges : (E, 2) int
         Pairs of points that a drawing connects.
@@ -77,6 +80,7 @@ class Landmarks:
     cameras: np.ndarray | None = None
     translations: np.ndarray | None = None
     sequence: np.ndarray | None = None
+    time: np.ndarray | None = None
     names: tuple[str, ...] = ()
     edges: np.ndarray = field(default_factory=_no_edges)
     name: str = "landmarks"
@@ -101,8 +105,9 @@ class Landmarks:
             setattr(self, key, value)
         if self.points2d is not None:
             checks.check_visible_finite("points2d", self.points2d, self.visible)
-        if self.points3d is not None:
-            checks.check_finite("points3d", self.points3d)
+        for key in ("points3d", "time"):
+            if getattr(self, key) is not None:
+                checks.check_finite(key, getattr(self, key))
         self.names, self.edges = _names_and_edges(self.names, self.edges, n_points)
 
     def __len__(self) -> int:

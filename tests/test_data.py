@@ -181,6 +181,8 @@ def test_the_ending_may_be_left_out_of_every_npz(landmarks, rng, tmp_path):
         ({"edges": [(0.9, 1)]}, "edges cannot be read as an array of whole numbers"),
         ({"sequence": [0, 0.5, 1]}, "sequence cannot be read as an array of whole numbers"),
         ({"sequence": [0, np.nan, 1]}, "sequence cannot be read as an array of whole numbers"),
+        ({"time": [0, 1, np.inf]}, r"time has 1 values that are not finite numbers \(the first in frame 2\)"),
+        ({"time": [0, 1]}, r"time has shape \(2,\); expected \(3,\)"),
     ],
 )
 @pytest.mark.filterwarnings("error")
@@ -193,6 +195,13 @@ def test_numbers_are_not_cut_to_whole_ones(wrong, message):
 def test_split_takes_a_share(landmarks):
     with pytest.raises(ValueError, match="test=nan"):
         landmarks.split(np.nan)
+
+
+def test_time_travels_with_the_frames(landmarks, tmp_path):
+    timed = nl.Landmarks(points2d=landmarks.points2d, time=[0, 0.1, 0.5, 0.6, 0.7, 2])
+    assert timed[[1, 5]].time.tolist() == [0.1, 2] and landmarks[:2].time is None
+    timed.save(tmp_path / "timed")
+    assert nl.datasets.load_npz(tmp_path / "timed").time.tolist() == timed.time.tolist()
 
 
 def test_landmarks_compare_as_objects(landmarks):

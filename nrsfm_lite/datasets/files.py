@@ -9,7 +9,7 @@ import numpy as np
 from ..data import Landmarks, find_npz, read_npz
 
 _KEYS = (
-    "points2d", "visible", "confidence", "points3d", "cameras", "translations", "sequence", "names", "edges",
+    "points2d", "visible", "confidence", "points3d", "cameras", "translations", "sequence", "time", "names", "edges",
 )  # fmt: skip
 
 
