@@ -10,6 +10,7 @@ import json
 import zipfile
 from collections.abc import Callable, Collection
 from dataclasses import KW_ONLY, dataclass, field, fields
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ def _no_edges() -> np.ndarray:
     return np.zeros((0, 2), int)
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Landmarks:
     """2D landmarks of F frames with P points each, and the truth where it is known.
 
@@ -70,6 +71,11 @@ class Landmarks:
     ValueError
         If neither points2d nor points3d is given, if a shape does not fit, or if a visible point
         is not a finite number.
+
+    Examples
+    --------
+    >>> nl.Landmarks(points2d=np.zeros((5, 3, 2)), names=["left", "middle", "right"], name="three")
+    Landmarks('three': 5 frames × 3 points; images, all visible)
     """
 
     points2d: np.ndarray | None = None
@@ -125,6 +131,23 @@ class Landmarks:
         chosen = {key: None if getattr(self, key) is None else getattr(self, key)[frames] for key in _FRAME_ARRAYS}
         return Landmarks(**chosen, names=self.names, edges=self.edges, name=self.name)
 
+    def __repr__(self) -> str:
+        parts = []
+        if self.points2d is not None:
+            parts.append(f"images, {_share(self.visible)} visible")
+            parts += ["confidence"] if self.confidence is not None else []
+        parts += ["3D truth"] if self.points3d is not None else []
+        parts += ["true cameras"] if self.cameras is not None else []
+        n_sequences = len(np.unique(self.sequence))
+        parts += [f"{n_sequences} sequences"] if n_sequences > 1 else []
+        return f"Landmarks({self.name!r}: {_size(self.visible)}; {', '.join(parts)})"
+
+    def _repr_html_(self) -> str:
+        """A line of text and a few frames as small pictures: of the images, or else of the shapes from the front."""
+        drawn = self.points3d[..., :2] if self.points2d is None else self.points2d
+        visible = np.ones_like(self.visible) if self.points2d is None else self.visible
+        return _html(repr(self), drawn, visible, self.edges, "#2a9d8f")
+
     def split(self, test: float = 0.2) -> tuple[Landmarks, Landmarks]:
         """(train, test) by whole sequences: the last max(1, round(test · n)) sequences are the test.
 
@@ -150,7 +173,7 @@ class Landmarks:
         return path
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Reconstruction:
     """What a method made of F frames: ``projections == shapes @ cameras + translations[:, None]``.
 
@@ -179,6 +202,11 @@ class Reconstruction:
     ------
     ValueError
         If a shape does not fit.
+
+    Examples
+    --------
+    >>> nl.Reconstruction(np.zeros((5, 3, 3)), nl.cameras.random_cameras(5), method="none")
+    Reconstruction('none': 5 frames × 3 points; shown all points, converged)
     """
 
     shapes: np.ndarray
@@ -214,6 +242,18 @@ class Reconstruction:
 
     def __len__(self) -> int:
         return len(self.shapes)
+
+    def __repr__(self) -> str:
+        shown = _share(self.visible)
+        parts = ["shown all points" if shown == "all" else f"shown {shown} of the points"]
+        parts += ["converged" if self.converged else "stopped before it converged"]
+        parts += [f"coherence {self.coherence:.3f}"] if self.coherence is not None else []
+        parts += ["with its network"] if self.model is not None else []
+        return f"Reconstruction({self.method!r}: {_size(self.visible)}; {', '.join(parts)})"
+
+    def _repr_html_(self) -> str:
+        """A line of text and a few frames as small pictures: each shape as its camera sees it."""
+        return _html(repr(self), self.shapes @ self.cameras, np.ones_like(self.visible), self.edges, "#e8702a")
 
     @property
     def projections(self) -> np.ndarray:
@@ -388,3 +428,46 @@ def _names_and_edges(names: Any, edges: Any, n_points: int) -> tuple[tuple[str, 
 def _npz(path: str | Path) -> Path:
     path = Path(path)
     return path if path.suffix == ".npz" else path.with_name(path.name + ".npz")
+
+
+def _size(visible: np.ndarray) -> str:
+    n_frames, n_points = visible.shape
+    return f"{n_frames} frame{'s' * (n_frames != 1)} × {n_points} point{'s' * (n_points != 1)}"
+
+
+def _share(visible: np.ndarray) -> str:
+    return "all" if visible.all() else f"{visible.mean():.1%}"
+
+
+def _html(text: str, points: np.ndarray, visible: np.ndarray, edges: np.ndarray, colour: str) -> str:
+    """The text, and up to five frames of points (F, P, 2) side by side as one small SVG; y runs up.
+
+    The colour is readable on white and on black, and the text takes the page's own.
+    """
+    text = f"<div>{escape(text)}</div>"
+    side, most = 100, 250  # pixels of a frame; points, and edges, that are drawn of a large set
+    dots = np.arange(0, points.shape[1], -(-points.shape[1] // most) or 1)
+    edges = edges[:: -(-len(edges) // most) or 1]
+    n_frames = min(5, len(points), max(1, 2 * most // max(1, len(dots) + len(edges))))
+    chosen = np.linspace(0, len(points) - 1, n_frames).round().astype(int)
+    shown = visible[chosen] & np.isfinite(points[chosen]).all(-1)
+    if not shown.any():
+        return text
+    points = np.where(shown[..., None], points[chosen], np.nan)
+    low, high = (
+        np.array([f(p[s], axis=0) if s.any() else (0, 0) for p, s in zip(points, shown, strict=True)])
+        for f in (np.min, np.max)
+    )
+    reach = (high - low).max() or 1.0
+    points = side / 2 + 0.9 * side * (points - (low + high)[:, None] / 2) / reach * (1, -1)
+    path = ""
+    for i, (frame, seen) in enumerate(zip(points, shown, strict=True)):
+        at = [f"{x + i * side:.0f} {y:.0f}" if s else "" for (x, y), s in zip(frame, seen, strict=True)]
+        path += "".join(f"M{at[a]}L{at[b]}" for a, b in edges if seen[a] and seen[b])
+        path += "".join(f"M{at[p]}h0" for p in dots if seen[p])  # a line of no length with round ends is a dot
+    width = n_frames * side
+    return (
+        f'{text}<svg width="{width}" height="{side}" viewBox="0 0 {width} {side}" role="img" '
+        f'aria-label="{n_frames} of the frames">'
+        f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="2.5" stroke-linecap="round"/></svg>'
+    )

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -202,6 +203,39 @@ def test_time_travels_with_the_frames(landmarks, tmp_path):
     assert timed[[1, 5]].time.tolist() == [0.1, 2] and landmarks[:2].time is None
     timed.save(tmp_path / "timed")
     assert nl.datasets.load_npz(tmp_path / "timed").time.tolist() == timed.time.tolist()
+
+
+def test_what_landmarks_and_reconstructions_say_of_themselves(landmarks, rng):
+    assert repr(landmarks) == "Landmarks('landmarks': 6 frames × 4 points; images, all visible, 3 sequences)"
+    visible = np.ones((6, 4), bool)
+    visible[0, 0] = False
+    views = nl.Landmarks(landmarks.points2d, visible, confidence=np.ones((6, 4)), points3d=np.zeros((6, 4, 3)))
+    assert repr(views[:2]) == "Landmarks('landmarks': 2 frames × 4 points; images, 87.5% visible, confidence, 3D truth)"
+    rec = nl.Reconstruction(
+        rng.normal(size=(1, 4, 3)), nl.cameras.random_cameras(1), method="bmm", coherence=0.25, converged=False
+    )
+    said = "Reconstruction('bmm': 1 frame × 4 points; shown all points, stopped before it converged, coherence 0.250)"
+    assert repr(rec) == said
+
+
+def test_small_pictures_of_landmarks_and_reconstructions(rng):
+    motion = nl.datasets.make_motion(60)
+    views = nl.datasets.make_views(motion, missing=0.2)
+    rec = nl.Reconstruction(views.points3d, views.cameras, edges=views.edges)
+    many = nl.Landmarks(points2d=rng.normal(size=(9, 3000, 2)), edges=rng.integers(0, 3000, (4000, 2)))
+    for source in (motion, views, rec, many):
+        page = source._repr_html_()
+        ElementTree.fromstring(f"<p>{page}</p>")  # well formed
+        assert len(page) < 10_000 and page.count("<path") == 1 and "M" in page
+        assert not re.search(r"nan|inf|href|src|script", page)
+    assert views._repr_html_().count("h0") == views.visible[[0, 15, 30, 44, 59]].sum(), "a dot for each visible point"
+    named = nl.Landmarks(points2d=np.zeros((1, 1, 2)), name="<script>")._repr_html_()
+    assert "<script>" not in named and "&lt;script&gt;" in named
+
+
+def test_pictures_of_nothing_are_words(landmarks):
+    for empty in (landmarks[:0], nl.Landmarks(np.full((2, 3, 2), np.nan), np.zeros((2, 3), bool))):
+        assert "<svg" not in empty._repr_html_() and "points" in empty._repr_html_()
 
 
 def test_landmarks_compare_as_objects(landmarks):
