@@ -56,6 +56,8 @@ def test_the_error_of_some_points_and_of_the_others_make_that_of_all(rng):
     np.testing.assert_allclose(share * some[1:] ** 2 + (1 - share) * rest[1:] ** 2, whole[1:] ** 2)
     with pytest.raises(ValueError, match=r"points has shape \(6, 8\)"):
         metrics.normalized_error(S, S_true, points=hidden[:, :8])
+    with pytest.raises(ValueError, match="points cannot be read as an array of truth values"):
+        metrics.normalized_error(S, S_true, points=np.where(hidden, 0.5, 0))
 
 
 def test_mpjpe_by_hand():
@@ -98,7 +100,10 @@ def test_a_flat_prediction_has_a_finite_error(rng):
     [
         (np.zeros((1, 5, 3)), np.zeros((1, 4, 3)), "have shapes"),
         (np.zeros((1, 5, 2)), np.zeros((1, 5, 2)), r"expected \(F, P, 3\)"),
-        (np.full((1, 5, 3), np.nan), np.ones((1, 5, 3)), "finite"),
+        (np.full((1, 5, 3), np.nan), np.ones((1, 5, 3)), "S has 15 values that are not finite"),
+        (np.ones((1, 5, 3)), np.full((1, 5, 3), np.inf), "S_true has 15 values that are not finite"),
+        (np.zeros((5, 3)), np.zeros((5, 3)), r"expected \(F, P, 3\)"),
+        ([[["a"]]], np.zeros((1, 5, 3)), "S cannot be read"),
         (np.zeros((1, 5, 3)), np.ones((1, 5, 3)), "all equal"),
     ],
 )
@@ -128,6 +133,15 @@ def test_cumulative_error_counts(rng):
     for a, s in zip(at[::40], share[::40], strict=True):
         assert s == np.mean(errors <= a)
     assert metrics.cumulative_error(errors, [0.5])[1] == np.mean(errors <= 0.5)
+
+
+def test_frames_without_an_error_do_not_count():
+    at, share = metrics.cumulative_error([0.1, np.nan, 0.4, 0.2])
+    assert at[-1] == 0.4 and share[-1] == 1 and np.isfinite(at).all()
+    assert metrics.cumulative_error([0.1, np.nan, 0.4, np.nan], [0.2])[1] == 0.5
+    for wrong, message in [([np.nan], "holds no number"), ([[0.1, 0.2]], r"shape \(1, 2\)"), (["a"], "cannot be read")]:
+        with pytest.raises(ValueError, match=message):
+            metrics.cumulative_error(wrong)
 
 
 def test_camera_frame_error_forgives_the_sign_of_depth_and_nothing_else(rng):
