@@ -62,7 +62,8 @@ def normalized_error(
 
     Parameters as in `align`. ``scale=True`` is the evaluation of the paper's authors;
     ``scale=False`` is the common per-frame error of the classical literature. Both forgive a mirror image in
-    each frame; ``reflections=False`` none at all.
+    each frame; `rotation_only_error` forgives one for the whole result, and ``reflections=False`` none at all,
+    which fits only data whose handedness the images decide.
 
     points : (F, P) bool, optional
         Count only these points, for instance the hidden ones; the alignment still takes all. Their root mean
@@ -92,6 +93,45 @@ def normalized_error(
     count = np.where(points.any(1), points.sum(1), np.nan)
     square = (((S - S_true) ** 2).sum(2) * points).sum(1) / count
     return np.sqrt(square / (S_true**2).sum(2).mean(1))
+
+
+def rotation_only_error(S: Any, S_true: Any, *, scale: bool = True, points: Any = None) -> np.ndarray:
+    """`normalized_error` with rotations only: a frame that is mirrored against the others pays for it.
+
+    The whole result is first mirrored or not, whichever has the smaller mean error over frames and points, for
+    orthographic images always leave that one choice. Then each frame is aligned by a rotation, SO(3). It is
+    at least as large as `normalized_error`, which mirrors frame by frame, and equal to it where no frame is
+    of the wrong hand.
+
+    Parameters
+    ----------
+    S, S_true, scale, points : as in `normalized_error`
+
+    Returns
+    -------
+    (F,) array
+
+    Raises
+    ------
+    ValueError
+        As `normalized_error`.
+
+    Examples
+    --------
+    >>> S_true = np.tile(np.eye(4, 3) * (1, 2, 3), (3, 1, 1))
+    >>> nl.metrics.rotation_only_error(S_true * (1, 1, -1), S_true).round(2) + 0
+    array([0., 0., 0.])
+    >>> one_flipped = S_true * np.array([1, 1, -1])[:, None, None]
+    >>> nl.metrics.rotation_only_error(one_flipped, S_true).round(2) + 0
+    array([0.  , 0.  , 0.41])
+    """
+    S, S_true = _pair(S, S_true)
+    hands = (S, -S)
+    whole = [normalized_error(hand, S_true, scale=scale, reflections=False) for hand in hands]
+    best = int(whole[1].mean() < whole[0].mean())
+    if points is None:
+        return whole[best]
+    return normalized_error(hands[best], S_true, scale=scale, reflections=False, points=points)
 
 
 def camera_frame_error(S: Any, S_true: Any) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -89,6 +90,31 @@ def test_handedness_counts_the_minority(rng):
     assert metrics.handedness(-flipped, S) == 0  # all mirrored: a convention, not an error
     flipped[:3] *= (1, 1, -1)
     assert metrics.handedness(flipped, S) == pytest.approx(0.3)
+
+
+def test_the_error_with_rotations_only_forgives_one_mirror_image_for_all_frames(rng):
+    S = rng.normal(size=(10, 9, 3))
+    moved = 3 * S @ random_rotations(10) + rng.normal(size=(10, 1, 3))
+    for hand in (moved, -moved, torch.as_tensor(moved * (1, -1, 1))):
+        np.testing.assert_allclose(metrics.rotation_only_error(hand, S), 0, atol=1e-12)
+    moved[:3] *= (1, 1, -1)
+    for hand in (moved, -moved):
+        error = metrics.rotation_only_error(hand, S)
+        np.testing.assert_allclose(error[3:], 0, atol=1e-12)
+        expected = [brute_force(-a, a, True, False) for a in S[:3]]
+        np.testing.assert_allclose(error[:3], expected, rtol=1e-6)
+    assert (metrics.rotation_only_error(moved, S, scale=False) > 0.1).all()
+
+
+def test_the_hand_of_the_whole_is_chosen_by_all_points(rng):
+    S = rng.normal(size=(6, 9, 3))
+    noisy = -S + 0.1 * rng.normal(size=S.shape)
+    some = rng.random((6, 9)) < 0.5
+    half, rest = (metrics.rotation_only_error(noisy, S, points=p) for p in (some, ~some))
+    whole = metrics.rotation_only_error(noisy, S)
+    share = some.mean(1)
+    np.testing.assert_allclose(share * half**2 + (1 - share) * rest**2, whole**2)
+    assert (whole < 0.3).all()
 
 
 def test_a_flat_prediction_has_a_finite_error(rng):
