@@ -86,10 +86,33 @@ def test_pa_mpjpe_is_the_least_squares_similarity(rng):
 def test_handedness_counts_the_minority(rng):
     S = rng.normal(size=(10, 9, 3))
     flipped = S @ random_rotations(10)
-    assert metrics.handedness(flipped, S) == 0
-    assert metrics.handedness(-flipped, S) == 0  # all mirrored: a convention, not an error
+    assert metrics.handedness(flipped, S) == (0, 0)
+    assert metrics.handedness(-flipped, S) == (0, 0)  # all mirrored: a convention, not an error
     flipped[:3] *= (1, 1, -1)
-    assert metrics.handedness(flipped, S) == pytest.approx(0.3)
+    assert metrics.handedness(flipped, S).mirrored == pytest.approx(0.3)
+
+
+def test_flat_frames_have_no_handedness(rng):
+    """A flat shape is its own mirror image; what is left of its depth is noise, and so is the sign."""
+    S = rng.normal(size=(40, 9, 3))
+    S[10:] *= (1, 1, 0)
+    S = S @ random_rotations(40)
+    seen = S + 1e-9 * rng.normal(size=S.shape)
+    seen[:3] = -seen[:3]
+    found = metrics.handedness(seen, S)
+    assert found.mirrored == pytest.approx(0.3) and found.left_out == pytest.approx(0.75)
+    nothing = metrics.handedness(seen[10:], S[10:])
+    assert np.isnan(nothing.mirrored) and nothing.left_out == 1
+
+
+def test_a_frame_counts_for_handedness_from_a_tenth_on(rng):
+    """The distance of a thin shape from its mirror image grows with its depth."""
+    flat = rng.normal(size=(1, 9, 3)) * (1, 1, 0)
+    depth = rng.normal(size=(1, 9, 3)) * (0, 0, 1)
+    for share in (0.01, 0.03, 0.1, 0.3):
+        S = flat + share * depth
+        own = metrics.normalized_error(S * (1, 1, -1), S, reflections=False)
+        assert (metrics.handedness(S, S).left_out == 0) == (own[0] > 0.1)
 
 
 def test_the_error_with_rotations_only_forgives_one_mirror_image_for_all_frames(rng):
