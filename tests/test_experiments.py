@@ -7,7 +7,7 @@ import types
 import pytest
 
 from nrsfm_lite import cli, experiments
-from nrsfm_lite.experiments import material, runner
+from nrsfm_lite.experiments.lab import runner, scoring
 
 
 @pytest.fixture
@@ -55,7 +55,7 @@ def test_provenance(toy, tmp_path):
     experiments.run("speed", folder=tmp_path, say=lambda line: None)
     origin = json.loads((tmp_path / "speed.json").read_text())
     assert origin["conditions"] == {"power": 2} and origin["command"] == "nrsfm experiment speed"
-    assert origin["data"]["motion-small"] == material.describe("motion-small")
+    assert origin["data"]["motion-small"] == scoring.describe("motion-small")
     (run,) = origin["runs"]
     assert run["rows"] == 4 and {"started", "commit", "device", "versions", "seconds"} <= run.keys()
     assert run["versions"]["torch"]
@@ -72,17 +72,17 @@ def test_unknown_names_are_refused(capsys):
     with pytest.raises(KeyError, match="unknown experiment 'x'"):
         experiments.run("x")
     with pytest.raises(KeyError, match="unknown data 'x'"):
-        material.load("x")
+        scoring.load("x")
     with pytest.raises(SystemExit):
         cli.main(["experiment", "x"])
     capsys.readouterr()
 
 
 def test_missing_real_data_is_one_sentence(monkeypatch, tmp_path):
-    material.load.cache_clear()
+    scoring.load.cache_clear()
     monkeypatch.setenv("NRSFM_DATA", str(tmp_path))
     with pytest.raises(FileNotFoundError, match="set NRSFM_DATA to a folder that holds cmu_bvh/martial"):
-        material.load("martial")
+        scoring.load("martial")
 
 
 def test_a_case_may_give_several_rows(toy, tmp_path):

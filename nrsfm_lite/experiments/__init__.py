@@ -1,5 +1,5 @@
 """The measurements of the book, as experiments that anyone can repeat: `nrsfm experiment NAME`."""
 
-from .runner import NAMES, run
+from .lab.runner import NAMES, run
 
 __all__ = ["NAMES", "run"]
