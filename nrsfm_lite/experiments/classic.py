@@ -51,8 +51,9 @@ def conditions(quick: bool) -> dict[str, object]:
         "other_hand": "share of frames, seen by their camera, of the other handedness",
         "image": "norm of the reprojection error over that of the centred images",
         "network": "nl.reconstruct with its defaults: frames in no order, each sequence on its own; the refinement "
-        "learns a prior over shapes from the same 2D points. one_pass: the same without the refinement. surprise: "
-        "−log likelihood of the images under that prior, without truth; among seeds, the lowest is to be preferred",
+        "learns a prior over shapes from the same 2D points. one_pass: the same without the refinement. "
+        "negative_log_likelihood: of the images under that prior, without truth; among seeds, the lowest is to be "
+        "preferred",
     }
 
 
@@ -66,8 +67,8 @@ def measure(data: str, method: str, seed: int) -> dict[str, object]:
         rec = reconstruct(truth.points2d, seed=seed, progress=False)
         plain = reconstruct(truth.points2d, model=rec.model, refine=False)
         one_pass = float(metrics.normalized_error(plain.shapes, truth.points3d, scale=False).mean())
-        surprise = quality.surprise(rec.model, truth.points2d)
-        return _errors(rec, truth, name) | {"one_pass": one_pass, "surprise": surprise, "own": ""}
+        unlikely = quality.negative_log_likelihood(rec.model, truth.points2d)
+        return _errors(rec, truth, name) | {"one_pass": one_pass, "negative_log_likelihood": unlikely, "own": ""}
     own = _own(name, variant, data)
     how = own | ({"seed": seed} if name in _BY_CHANCE else {})
     how |= {} if name in ("tomasi_kanade", "pta") else {"progress": False}
@@ -77,18 +78,18 @@ def measure(data: str, method: str, seed: int) -> dict[str, object]:
     rec = getattr(baselines, name)(W, **how)
     return _errors(rec, truth, name) | {
         "one_pass": "",
-        "surprise": "",
+        "negative_log_likelihood": "",
         "own": " ".join(f"{k}={v}" for k, v in own.items()),
     }
 
 
 def report(rows: list[dict[str, str]]) -> str:
-    """Mean and spread over seeds, a line per method and sequence; and the network that is least surprised."""
+    """Mean and spread over seeds, a line per method and sequence; and the network that finds its images likeliest."""
     text = scoring.by_groups(("method", "data"), ("per_frame", "e3d_world", "e3d_camera", "seconds"), rows)
     networks = [r for r in rows if r["method"] == "network"]
     for data in dict.fromkeys(r["data"] for r in networks):
-        chosen = min((r for r in networks if r["data"] == data), key=lambda r: float(r["surprise"]))
-        text += f"\nnetwork of least surprise, data {data}: per_frame {chosen['per_frame']} (seed {chosen['seed']})"
+        chosen = min((r for r in networks if r["data"] == data), key=lambda r: float(r["negative_log_likelihood"]))
+        text += f"\nlikeliest network, data {data}: per_frame {chosen['per_frame']} (seed {chosen['seed']})"
     return text
 
 

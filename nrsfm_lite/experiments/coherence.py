@@ -9,8 +9,8 @@ from ..training import fit
 from .lab import scoring
 
 QUESTION = "Does the coherence of the last dictionary, or any other score without ground truth, rank networks?"
-SCORES = ("coherence", "image_error", "consistency", "turn_consistency", "distortion", "code_dimension", "surprise")
-SCORES += ("image_unseen",)
+SCORES = ("coherence", "image_error", "consistency", "turn_consistency", "distortion", "code_dimension")
+SCORES += ("negative_log_likelihood", "image_unseen")
 _LOOKS = 12  # at a network while it trains
 _FRAMES = 1000  # of each look
 _SETTINGS = {"default": {}, "half rates": {"rates": 0.5}, "double rates": {"rates": 2}, "no pull": {"pull": 0.0}}
@@ -30,7 +30,8 @@ def conditions(quick: bool) -> dict[str, object]:
         "network": "the default",
         "settings": "the default schedule, its learning rates halved or doubled, and without the pull to the mean",
         "steps": scoring.QUICK_STEPS if quick else "the default schedule's",
-        "looks": f"{_LOOKS} in each training, on {_FRAMES} frames drawn once; surprise and refined at the end only",
+        "looks": f"{_LOOKS} in each training, on {_FRAMES} frames drawn once; negative_log_likelihood and refined at "
+        "the end only",
         "errors": "normalised 3D error; seen, unseen: one forward pass; refined: as `reconstruct` does",
     }
 
@@ -82,7 +83,7 @@ def report(rows: list[dict[str, str]]) -> str:
     lines = []
     for score in SCORES:
         parts = [f"{e} {_words(rank(rows, score, e))}" for e in ("seen", "refined")]
-        lines.append(f"{score:17s} " + "; ".join([*parts, f"within trainings {_words(rank_within(rows, score))}"]))
+        lines.append(f"{score:23s} " + "; ".join([*parts, f"within trainings {_words(rank_within(rows, score))}"]))
     return "\n".join(lines)
 
 
