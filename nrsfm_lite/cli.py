@@ -113,9 +113,12 @@ def _reconstruct(arguments: argparse.Namespace) -> None:
     )
     if data.points3d is not None:
         error = metrics.normalized_error(rec.shapes, data.points3d).mean()
-        flips = metrics.handedness(rec.shapes, data.points3d)
-        print(f"mean normalised 3D error: {error:.4f} (per frame up to rotation, mirror and scale)")
-        print(f"frames of the other handedness: {flips:.1%}")
+        turned = metrics.rotation_only_error(rec.shapes, data.points3d).mean()
+        hand = metrics.handedness(rec.shapes, data.points3d)
+        print(f"mean normalised 3D error: {error:.4f} (each frame scaled, turned and mirrored onto the truth)")
+        print(f"with rotations only: {turned:.4f} (all frames mirrored, or none)")
+        if hand.left_out < 1:  # else the truth is flat, and has no hand
+            print(f"frames mirrored against the others: {hand.mirrored:.1%}")
     print(f"coherence of the last dictionary: {rec.coherence:.3f}")
     if arguments.save:
         print(f"wrote {rec.save(arguments.save)}")

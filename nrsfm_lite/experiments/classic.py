@@ -115,7 +115,7 @@ def _errors(rec, truth, method):
         "e3d_world": float(metrics.e3d(rec.shapes, truth.points3d).mean()) if in_world else "",
         "e3d_camera": float(metrics.e3d(seen, true).mean()),
         "camera_degrees": float(cameras.rotation_error(rec.cameras, truth.cameras).mean()) if in_world else "",
-        "other_hand": metrics.handedness(seen, true),
+        "other_hand": metrics.handedness(seen, true).mirrored,
         "image": float((missed**2).sum() ** 0.5 / (X**2).sum() ** 0.5),
         "converged": rec.converged,
     }

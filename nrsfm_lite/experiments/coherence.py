@@ -52,7 +52,7 @@ def measure(data: str, setting: str, seed: int) -> list[dict[str, object]]:
     net = fit(train, schedule=plan, steps=steps, seed=seed, progress=False, callback=look)
     refined = reconstruct(some, model=net)
     last = {"refined": metrics.normalized_error(refined.shapes, some.points3d).mean()}
-    last["other_hand"] = metrics.handedness(refined.shapes, some.points3d)
+    last["other_hand"] = metrics.handedness(refined.shapes, some.points3d).mirrored
     return [*rows, {"step": steps, **_look(net, some, others), **{k: float(v) for k, v in last.items()}}]
 
 
@@ -105,5 +105,5 @@ def _look(net, some, others):
         "seen": float(metrics.normalized_error(plain.shapes, some.points3d).mean()),
         "unseen": float(metrics.normalized_error(new.shapes, others.points3d).mean()),
         "refined": float("nan"),
-        "other_hand": metrics.handedness(plain.shapes, some.points3d),
+        "other_hand": metrics.handedness(plain.shapes, some.points3d).mirrored,
     }
