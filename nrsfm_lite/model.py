@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from . import data, normalizer, weights
+from . import normalizer, weights
 from .cameras import nearest_orthonormal
 from .checks import one_of, truth, whole
 from .normalizer import Normalizer
@@ -360,7 +360,3 @@ class DeepNRSfM(nn.Module):
         except (KeyError, TypeError, RuntimeError, ValueError):
             raise ValueError("the network in it is incomplete or of another version.") from None
         return net.eval()
-
-
-# `data` is below this module and reads networks back without knowing how one is built.
-data.network_from_arrays = DeepNRSfM.from_arrays

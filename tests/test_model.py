@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import nrsfm_lite as nl
-from nrsfm_lite.experiments.convolution import ConvolutionNet
+from nrsfm_lite.experiments.lab.convolution import ConvolutionNet
 from nrsfm_lite.model import EPSILON
 
 

@@ -10,7 +10,7 @@ from ..model import Config, DeepNRSfM
 from ..preprocessing import set_scale
 from ..threads import use_threads
 from ..training import PRIOR_FRAMES, SCHEDULES, make_optimizers, warmup_cosine
-from . import material
+from .lab import scoring
 
 QUESTION = "Which changes of the training, or of the network, help on unseen frames? Would 3D supervision?"
 _DEPTH = "3D supervision"
@@ -21,7 +21,7 @@ _NOISE = 0.05  # of a frame's norm
 _HIDDEN = 0.2  # of the points, at most
 
 
-def cases(quick):
+def cases(quick: bool) -> list[dict[str, object]]:
     """Data, change and seed: all changes where settings may be chosen, the comparison with 3D also elsewhere."""
     if quick:
         return [{"data": "motion-small", "change": c, "seed": 0} for c in _CHANGES]
@@ -29,11 +29,11 @@ def cases(quick):
     return [{"data": d, "change": c, "seed": s} for s in range(3) for d, c in chosen]
 
 
-def conditions(quick):
+def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "network": "the default",
-        "steps": material.QUICK_STEPS if quick else SCHEDULES["default"].steps,
+        "steps": scoring.QUICK_STEPS if quick else SCHEDULES["default"].steps,
         "schedule": "the default; with 3D supervision without its pull",
         "errors": "mean normalised 3D error; seen, unseen: one pass; refined: with a shape prior learned as in `fit`",
         _DEPTH: "the loss takes the depth of every point, beside its image, from the truth; shown for comparison only",
@@ -42,19 +42,19 @@ def conditions(quick):
     }
 
 
-def measure(data, change, seed):
+def measure(data: str, change: str, seed: int) -> dict[str, object]:
     """Errors of one network, or of an ensemble, trained with one change."""
-    train, test = material.views(data)
+    train, test = scoring.views(data)
     seeds = (3 * seed, 3 * seed + 1, 3 * seed + 2) if change == _ENSEMBLE else (seed,)
-    steps = material.quick_steps(data) or SCHEDULES["default"].steps
+    steps = scoring.quick_steps(data) or SCHEDULES["default"].steps
     with use_threads(1):
         nets = [_train(train, change, steps, s) for s in seeds]
         return _errors(nets, change, train, test)
 
 
-def report(rows):
+def report(rows: list[dict[str, str]]) -> str:
     """Mean and spread over seeds, a line per data set and change."""
-    return material.by_groups(("data", "change"), ("seen", "unseen", "refined", "refined_unseen"), rows)
+    return scoring.by_groups(("data", "change"), ("seen", "unseen", "refined", "refined_unseen"), rows)
 
 
 def _train(views, change, steps, seed):
