@@ -54,7 +54,13 @@ def load_bvh(path: str | Path | Sequence[str | Path], joints: Sequence[str] | No
 
     Examples
     --------
-    >>> data = nl.datasets.load_bvh("walk.bvh", joints=nl.datasets.CMU_BODY)  # doctest: +SKIP
+    >>> import pathlib, tempfile
+    >>> file = pathlib.Path(tempfile.mkdtemp(), "arm.bvh")
+    >>> hierarchy = "HIERARCHY ROOT arm { OFFSET 0 0 0 CHANNELS 1 Zrotation End Site { OFFSET 1 0 0 } }"
+    >>> _ = file.write_text(hierarchy + "\\nMOTION\\nFrames: 1\\nFrame Time: .1\\n90")
+    >>> data = nl.datasets.load_bvh(file)
+    >>> data.names, data.points3d[0, 1].round(3) + 0
+    (('arm', 'arm_end'), array([0., 1., 0.]))
     """
     every = whole("every", every, 1)
     if isinstance(joints, str):
