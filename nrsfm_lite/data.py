@@ -80,8 +80,8 @@ class Landmarks:
 
     points2d: np.ndarray | None = None
     visible: np.ndarray | None = None
-    _: KW_ONLY
     confidence: np.ndarray | None = None
+    _: KW_ONLY
     points3d: np.ndarray | None = None
     cameras: np.ndarray | None = None
     translations: np.ndarray | None = None
