@@ -26,15 +26,14 @@ UNKNOWN = 5  # a file that is not listed
 _times = defaultdict(float)
 
 
-@pytest.fixture(autouse=True)
-def _names_of_the_examples(request):
+@pytest.fixture(autouse=True, scope="session")
+def _names_of_the_examples(doctest_namespace):
     """What the examples in docstrings may use without importing it."""
-    if isinstance(request.node, pytest.DoctestItem):
-        import numpy as np
+    import numpy as np
 
-        import nrsfm_lite as nl
+    import nrsfm_lite as nl
 
-        request.getfixturevalue("doctest_namespace").update(nl=nl, np=np)
+    doctest_namespace.update(nl=nl, np=np)
 
 
 def pytest_configure(config):
