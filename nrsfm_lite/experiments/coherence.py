@@ -9,8 +9,8 @@ from ..training import fit
 from . import material
 
 QUESTION = "Does the coherence of the last dictionary, or any other score without ground truth, rank networks?"
-SCORES = ("coherence", "image_error", "consistency", "turn_consistency", "distortion", "code_dimension", "surprise")
-SCORES += ("image_unseen",)
+SCORES: tuple[str, ...] = ("coherence", "image_error", "consistency", "turn_consistency", "distortion")
+SCORES += ("code_dimension", "surprise", "image_unseen")
 _LOOKS = 12  # at a network while it trains
 _FRAMES = 1000  # of each look
 _SETTINGS = {"default": {}, "half rates": {"rates": 0.5}, "double rates": {"rates": 2}, "no pull": {"pull": 0.0}}
