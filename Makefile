@@ -45,7 +45,7 @@ site: $(READY)   ## look at the built book in headless Chromium (needs chromium;
 	@$(BIN)/python -m pytest -q -p no:nbval -o addopts= book/check_site.py
 
 picture: $(READY) ## remake book/_static/reconstruction.png, the picture of the README
-	@$(BIN)/python -m nrsfm_lite.experiments.picture book/_static/reconstruction.png
+	@$(BIN)/python book/make_picture.py book/_static/reconstruction.png
 
 clean:           ## remove the environment and everything built
 	@echo "Removing .venv and _build …"

@@ -1,18 +1,44 @@
-"""The `nrsfm` command."""
+"""The `nrsfm` command.
+
+PyTorch, SciPy and plotly take seconds to load. So the commands import what they need themselves, and only after
+they have looked at the arguments and files: a slip of the pen is answered at once.
+"""
+
+from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from . import __version__, datasets, experiments, metrics, plotting
-from .data import Reconstruction
-from .reconstruction import reconstruct
+from . import __version__, experiments
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from .data import Landmarks, Reconstruction
 
 _FORMATS = ("npz", "bvh")
 
 
-def main(argv=None):
-    """Run the command line; returns the exit code: 0, or 2 after one sentence on bad input."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Default: the words that the program was called with.
+
+    Returns
+    -------
+    The exit code: 0, 2 after one sentence on bad input, or 130 after an interruption.
+
+    Examples
+    --------
+    >>> main(["reconstruct", "points.npz", "--out", "scene.html"])  # doctest: +SKIP
+    0
+    """
     arguments = _parser().parse_args(argv)
     try:
         arguments.run(arguments)
@@ -27,7 +53,7 @@ def main(argv=None):
     return 0
 
 
-def _parser():
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="nrsfm", description="Non-rigid structure from motion: 2D landmarks in, 3D shapes and cameras out."
     )
@@ -47,7 +73,7 @@ def _parser():
     make.add_argument("--joints", metavar="A,B,…", help="bvh: only these joints, or 'cmu' for a 31-point body")
     make.add_argument("--every", type=int, default=1, metavar="N", help="bvh: keep every N-th frame")
     make.add_argument("--steps", type=int, help="training steps")
-    make.add_argument("--seed", type=int, default=0)
+    make.add_argument("--seed", type=int, default=0, help="decides the training's start and order, and the cameras")
     make.add_argument("--checkpoint", type=Path, help="keep the state here, and go on from it if it exists")
     make.add_argument("--quiet", action="store_true", help="no progress bar")
     make.set_defaults(run=_reconstruct)
@@ -69,9 +95,14 @@ def _parser():
     return parser
 
 
-def _reconstruct(arguments):
+def _reconstruct(arguments: argparse.Namespace) -> None:
+    kind = _kind(arguments)
     _check_targets(arguments.out, arguments.save, arguments.checkpoint)
-    data = _load(arguments)
+    _check_numbers(arguments)
+    data = _load(arguments, kind)
+    from . import datasets, metrics
+    from .reconstruction import reconstruct
+
     if data.points2d is None:
         data = datasets.make_views(data, seed=arguments.seed)
         print(f"{len(data)} frames of {data.n_points} points, seen by one random orthographic camera each")
@@ -82,9 +113,12 @@ def _reconstruct(arguments):
     )
     if data.points3d is not None:
         error = metrics.normalized_error(rec.shapes, data.points3d).mean()
-        flips = metrics.handedness(rec.shapes, data.points3d)
-        print(f"mean normalised 3D error: {error:.4f} (per frame up to rotation, mirror and scale)")
-        print(f"frames of the other handedness: {flips:.1%}")
+        turned = metrics.rotation_only_error(rec.shapes, data.points3d).mean()
+        hand = metrics.handedness(rec.shapes, data.points3d)
+        print(f"mean normalised 3D error: {error:.4f} (each frame scaled, turned and mirrored onto the truth)")
+        print(f"with rotations only: {turned:.4f} (all frames mirrored, or none)")
+        if hand.left_out < 1:  # else the truth is flat, and has no hand
+            print(f"frames mirrored against the others: {hand.mirrored:.1%}")
     print(f"coherence of the last dictionary: {rec.coherence:.3f}")
     if arguments.save:
         print(f"wrote {rec.save(arguments.save)}")
@@ -92,7 +126,7 @@ def _reconstruct(arguments):
         _write_scene(rec, arguments, truth=data.points3d)
 
 
-def _check_targets(*targets):
+def _check_targets(*targets: Path | None) -> None:
     """Find out before the training, not after it, that a result cannot be written."""
     for target in targets:
         if target is not None and not target.parent.is_dir():
@@ -101,38 +135,61 @@ def _check_targets(*targets):
             raise ValueError(f"{target}: is a folder; expected the name of a file to write.")
 
 
-def _load(arguments):
-    file = arguments.file
-    if not file.exists():
-        raise FileNotFoundError(f"{file}: no such file.")
-    kind = arguments.format
+def _check_numbers(arguments: argparse.Namespace) -> None:
+    from .checks import whole
+
+    for name, least in (("steps", 1), ("every", 1), ("seed", 0)):
+        value = getattr(arguments, name)
+        if value is not None:
+            whole(f"--{name}", value, least)
+
+
+def _kind(arguments: argparse.Namespace) -> str:
+    """The format of the file, after a look at its name and size."""
+    file, kind = arguments.file, arguments.format
+    _check_there(file)
     if kind == "auto":
         kind = "bvh" if file.is_dir() else file.suffix.lower().removeprefix(".")
-    if kind == "npz":
-        if arguments.joints is not None or arguments.every != 1:
-            raise ValueError("--joints and --every are for .bvh files; points in an .npz are taken as they are.")
-        return datasets.load_npz(file)
-    if kind == "bvh":
-        joints = arguments.joints
-        if joints is not None:
-            joints = datasets.CMU_BODY if joints == "cmu" else [joint.strip() for joint in joints.split(",")]
-        return datasets.load_bvh(file, joints=joints, every=arguments.every)
-    if file.stat().st_size == 0:
+    if file.is_file() and file.stat().st_size == 0:
         raise ValueError(f"{file}: the file is empty.")
-    raise ValueError(f"{file}: cannot tell the format from its ending; give --format {' or '.join(_FORMATS)}.")
+    if kind not in _FORMATS:
+        raise ValueError(f"{file}: cannot tell the format from its ending; give --format {' or '.join(_FORMATS)}.")
+    if kind == "npz" and (arguments.joints is not None or arguments.every != 1):
+        raise ValueError("--joints and --every are for .bvh files; points in an .npz are taken as they are.")
+    return kind
 
 
-def _view(arguments):
+def _check_there(file: Path) -> None:
+    if not file.exists():
+        raise FileNotFoundError(f"{file}: no such file.")
+
+
+def _load(arguments: argparse.Namespace, kind: str) -> Landmarks:
+    from . import datasets
+
+    if kind == "npz":
+        return datasets.load_npz(arguments.file)
+    joints = arguments.joints
+    if joints is not None:
+        joints = datasets.CMU_BODY if joints == "cmu" else [joint.strip() for joint in joints.split(",")]
+    return datasets.load_bvh(arguments.file, joints=joints, every=arguments.every)
+
+
+def _view(arguments: argparse.Namespace) -> None:
+    _check_there(arguments.file)
     _check_targets(arguments.out)
-    rec = Reconstruction.load(arguments.file)
-    _write_scene(rec, arguments)
+    from .data import Reconstruction
+
+    _write_scene(Reconstruction.load(arguments.file), arguments)
 
 
-def _experiment(arguments):
+def _experiment(arguments: argparse.Namespace) -> None:
     experiments.run(arguments.name, quick=arguments.quick, folder=arguments.out)
 
 
-def _write_scene(rec, arguments, truth=None):
+def _write_scene(rec: Reconstruction, arguments: argparse.Namespace, truth: np.ndarray | None = None) -> None:
+    from . import plotting
+
     figure = plotting.show3d(rec, truth=truth, max_frames=150, title=arguments.file.name, height=700)
     plotting.write_html(figure, arguments.out)
     print(f"wrote {arguments.out}")

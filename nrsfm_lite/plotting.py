@@ -7,7 +7,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import plotly.graph_objects as go
 
-from .data import Landmarks, Reconstruction, as_points
+from .data import Landmarks, Reconstruction
+from .images import parse
 from .metrics import align
 
 # Readable on white and on black, and for readers who do not tell red from green.
@@ -103,9 +104,9 @@ def show2d(W, edges=None, frames=None, *, visible=None, columns=6):
     -------
     matplotlib Figure
     """
-    W, visible, _, own_edges = as_points(W, visible)
-    W = np.where(visible[..., None], W, np.nan)
-    edges = np.asarray(own_edges if edges is None else edges, int).reshape(-1, 2)
+    images = parse(W, visible)
+    W = np.where(images.visible[..., None], images.points, np.nan)
+    edges = np.asarray(images.edges if edges is None else edges, int).reshape(-1, 2)
     frames = _spread(len(W), columns) if frames is None else np.asarray(frames)
     figure, axes = plt.subplots(1, len(frames), figsize=(1.5 * len(frames), 1.9), layout="constrained", squeeze=False)
     middle = np.nanmean(W[frames], axis=1)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import nrsfm_lite as nl
+from nrsfm_lite import reconstruction
 from nrsfm_lite.cli import main
 from tests.test_datasets_bvh import ARM
 
@@ -22,7 +23,9 @@ def test_reconstruct_then_view(points, tmp_path, capsys):
     scene, result, again = tmp_path / "scene.html", tmp_path / "result.npz", tmp_path / "again.html"
     command = ["reconstruct", str(points), "--out", str(scene), "--save", str(result), "--steps", "20", "--quiet"]
     assert main(command) == 0
-    assert "mean normalised 3D error: 0." in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    for words in ("mean normalised 3D error: 0.", "with rotations only: ", "frames mirrored against the others: "):
+        assert words in printed
     assert scene.stat().st_size > 1e6 and nl.Reconstruction.load(result).model is not None
     assert main(["view", str(result), "--out", str(again)]) == 0 and again.exists()
 
@@ -77,6 +80,50 @@ def test_bad_files_get_one_sentence_and_exit_code_2(tmp_path, capsys):
         error = capsys.readouterr().err
         assert words in error, error
         assert error.startswith("nrsfm: ") and error.count("\n") == 1 and "Traceback" not in error
+
+
+def test_numbers_out_of_range_get_one_sentence(points, capsys):
+    for option, value, words in [
+        ("--steps", "0", "--steps=0; expected a whole number, at least 1."),
+        ("--seed", "-1", "--seed=-1; expected a whole number, at least 0."),
+    ]:
+        assert main(["reconstruct", str(points), option, value]) == 2
+        error = capsys.readouterr().err
+        assert words in error and error.count("\n") == 1, error
+
+
+def test_every_counts_frames(tmp_path, capsys):
+    (tmp_path / "two.bvh").write_text(ARM)
+    assert main(["reconstruct", str(tmp_path / "two.bvh"), "--every", "-2"]) == 2
+    assert "--every=-2; expected a whole number, at least 1." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--version"],
+        ["reconstruct", "none.bvh"],
+        ["reconstruct", __file__],
+        ["reconstruct", "none.npz", "--out", "no/scene.html"],
+        ["view", "none.npz", "--out", "scene.html"],
+        ["experiment", "none"],
+    ],
+    ids=["version", "no file", "other format", "no folder", "nothing to view", "no experiment"],
+)
+def test_a_slip_is_answered_without_loading_anything_heavy(words):
+    heavy = "{'torch', 'numpy', 'scipy', 'matplotlib', 'plotly'} & sys.modules.keys()"
+    code = f"import sys, nrsfm_lite.cli as cli\ntry: cli.main({words!r})\nfinally: print('loaded:', *{heavy})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip().endswith("loaded:"), done.stdout
+
+
+def test_an_interruption_is_exit_code_130(points, monkeypatch, capsys):
+    def stop(*arguments, **named):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reconstruction, "reconstruct", stop)
+    assert main(["reconstruct", str(points)]) == 130
+    assert "interrupted" in capsys.readouterr().err
 
 
 def test_a_folder_that_is_not_there_is_noticed_before_training(points, tmp_path, capsys):

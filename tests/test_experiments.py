@@ -1,13 +1,15 @@
 """The runner: every case once, provenance, and going on after an interruption."""
 
 import csv
+import doctest
 import json
+import math
 import types
 
 import pytest
 
 from nrsfm_lite import cli, experiments
-from nrsfm_lite.experiments import material, runner
+from nrsfm_lite.experiments.lab import process, runner, scoring
 
 
 @pytest.fixture
@@ -55,7 +57,7 @@ def test_provenance(toy, tmp_path):
     experiments.run("speed", folder=tmp_path, say=lambda line: None)
     origin = json.loads((tmp_path / "speed.json").read_text())
     assert origin["conditions"] == {"power": 2} and origin["command"] == "nrsfm experiment speed"
-    assert origin["data"]["motion-small"] == material.describe("motion-small")
+    assert origin["data"]["motion-small"] == scoring.describe("motion-small")
     (run,) = origin["runs"]
     assert run["rows"] == 4 and {"started", "commit", "device", "versions", "seconds"} <= run.keys()
     assert run["versions"]["torch"]
@@ -71,18 +73,9 @@ def test_a_table_of_something_else_is_left_alone(toy, tmp_path):
 def test_unknown_names_are_refused(capsys):
     with pytest.raises(KeyError, match="unknown experiment 'x'"):
         experiments.run("x")
-    with pytest.raises(KeyError, match="unknown data 'x'"):
-        material.load("x")
     with pytest.raises(SystemExit):
         cli.main(["experiment", "x"])
     capsys.readouterr()
-
-
-def test_missing_real_data_is_one_sentence(monkeypatch, tmp_path):
-    material.load.cache_clear()
-    monkeypatch.setenv("NRSFM_DATA", str(tmp_path))
-    with pytest.raises(FileNotFoundError, match="set NRSFM_DATA to a folder that holds cmu_bvh/martial"):
-        material.load("martial")
 
 
 def test_a_case_may_give_several_rows(toy, tmp_path):
@@ -98,3 +91,9 @@ def test_the_quick_form_of_every_experiment_runs(name, tmp_path, capsys):
     assert cli.main(["experiment", name, "--quick", "--out", str(tmp_path)]) == 0
     assert read(tmp_path / f"{name}.csv") and (tmp_path / f"{name}.json").exists()
     assert capsys.readouterr().out
+
+
+def test_the_examples_of_the_laboratory():
+    for module in (process, scoring):
+        done = doctest.testmod(module, extraglobs={"math": math})
+        assert done.attempted and not done.failed

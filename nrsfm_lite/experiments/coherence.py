@@ -6,17 +6,17 @@ from scipy.stats import spearmanr
 from .. import metrics, quality
 from ..reconstruction import reconstruct
 from ..training import fit
-from . import material
+from .lab import scoring
 
 QUESTION = "Does the coherence of the last dictionary, or any other score without ground truth, rank networks?"
-SCORES: tuple[str, ...] = ("coherence", "image_error", "consistency", "turn_consistency", "distortion")
-SCORES += ("code_dimension", "surprise", "image_unseen")
+SCORES = ("coherence", "image_error", "consistency", "turn_consistency", "distortion", "code_dimension")
+SCORES += ("negative_log_likelihood", "image_unseen")
 _LOOKS = 12  # at a network while it trains
 _FRAMES = 1000  # of each look
 _SETTINGS = {"default": {}, "half rates": {"rates": 0.5}, "double rates": {"rates": 2}, "no pull": {"pull": 0.0}}
 
 
-def cases(quick):
+def cases(quick: bool) -> list[dict[str, object]]:
     """Data, setting of the schedule, and seed: 16 networks for each data set."""
     data, settings, seeds = (
         (["motion-small"], ["default"], 2) if quick else (["motion", "salsa", "martial"], _SETTINGS, 4)
@@ -24,23 +24,24 @@ def cases(quick):
     return [{"data": d, "setting": s, "seed": i} for d in data for s in settings for i in range(seeds)]
 
 
-def conditions(quick):
+def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "network": "the default",
         "settings": "the default schedule, its learning rates halved or doubled, and without the pull to the mean",
-        "steps": material.QUICK_STEPS if quick else "the default schedule's",
-        "looks": f"{_LOOKS} in each training, on {_FRAMES} frames drawn once; surprise and refined at the end only",
+        "steps": scoring.QUICK_STEPS if quick else "the default schedule's",
+        "looks": f"{_LOOKS} in each training, on {_FRAMES} frames drawn once; negative_log_likelihood and refined at "
+        "the end only",
         "errors": "normalised 3D error; seen, unseen: one forward pass; refined: as `reconstruct` does",
     }
 
 
-def measure(data, setting, seed):
+def measure(data: str, setting: str, seed: int) -> list[dict[str, object]]:
     """A row for each look at the network while it trains, and one for the end."""
-    train, test = material.views(data)
+    train, test = scoring.views(data)
     some, others = _draw(train), _draw(test)
-    plan = material.default_schedule(**_SETTINGS[setting])
-    steps = material.quick_steps(data) or plan.steps
+    plan = scoring.default_schedule(**_SETTINGS[setting])
+    steps = scoring.quick_steps(data) or plan.steps
     looks = {round(steps * (i + 1) / _LOOKS) for i in range(_LOOKS - 1)}
     rows = []
 
@@ -51,11 +52,11 @@ def measure(data, setting, seed):
     net = fit(train, schedule=plan, steps=steps, seed=seed, progress=False, callback=look)
     refined = reconstruct(some, model=net)
     last = {"refined": metrics.normalized_error(refined.shapes, some.points3d).mean()}
-    last["other_hand"] = metrics.handedness(refined.shapes, some.points3d)
+    last["other_hand"] = metrics.handedness(refined.shapes, some.points3d).mirrored
     return [*rows, {"step": steps, **_look(net, some, others), **{k: float(v) for k, v in last.items()}}]
 
 
-def rank(rows, score, error):
+def rank(rows: list[dict[str, str]], score: str, error: str) -> dict[str, float]:
     """Spearman's correlation of a score and an error over the final networks of each data set: {data: rho}."""
     result = {}
     for data in dict.fromkeys(r["data"] for r in rows):
@@ -64,7 +65,7 @@ def rank(rows, score, error):
     return result
 
 
-def rank_within(rows, score):
+def rank_within(rows: list[dict[str, str]], score: str) -> dict[str, float]:
     """The same over the looks at one network, mean over the networks of a data set: {data: rho}."""
     result = {}
     for data in dict.fromkeys(r["data"] for r in rows):
@@ -77,12 +78,12 @@ def rank_within(rows, score):
     return result
 
 
-def report(rows):
+def report(rows: list[dict[str, str]]) -> str:
     """Rank correlation of each score with the errors of the final networks, and within trainings."""
     lines = []
     for score in SCORES:
         parts = [f"{e} {_words(rank(rows, score, e))}" for e in ("seen", "refined")]
-        lines.append(f"{score:17s} " + "; ".join([*parts, f"within trainings {_words(rank_within(rows, score))}"]))
+        lines.append(f"{score:23s} " + "; ".join([*parts, f"within trainings {_words(rank_within(rows, score))}"]))
     return "\n".join(lines)
 
 
@@ -104,5 +105,5 @@ def _look(net, some, others):
         "seen": float(metrics.normalized_error(plain.shapes, some.points3d).mean()),
         "unseen": float(metrics.normalized_error(new.shapes, others.points3d).mean()),
         "refined": float("nan"),
-        "other_hand": metrics.handedness(plain.shapes, some.points3d),
+        "other_hand": metrics.handedness(plain.shapes, some.points3d).mirrored,
     }

@@ -5,8 +5,8 @@ import time
 from .. import baselines, metrics
 from ..baselines.limits import TooLarge
 from ..datasets import make_views
-from . import material
-from .process import apart, peak_mb
+from .lab import scoring
+from .lab.process import apart, peak_mb
 
 QUESTION = "How do time and memory of the classical methods grow with the number of frames?"
 _FRAMES = (100, 300, 1000, 3000, 10_500)
@@ -14,14 +14,14 @@ _METHODS = ("tomasi_kanade", "pta", "bmm", "sfc", "ksta", "riks", "cns", "nlo", 
 _LONG = 600  # seconds by a method's own estimate, above which it refuses here; users are granted an hour
 
 
-def cases(quick):
+def cases(quick: bool) -> list[dict[str, object]]:
     """Frames and method; the small sizes first."""
     frames = (60, 120) if quick else _FRAMES
     methods = _METHODS[:4] if quick else _METHODS
     return [{"data": f"motion-{n}", "method": m} for n in frames for m in methods]
 
 
-def conditions(quick):
+def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "views": "31 points, a random camera per frame; own parameters at their defaults",
@@ -32,12 +32,12 @@ def conditions(quick):
     }
 
 
-def measure(data, method):
+def measure(data: str, method: str) -> dict[str, object]:
     """Seconds, megabytes and error."""
     return apart(_reconstruct, data, method, one_thread=True)
 
 
-def report(rows):
+def report(rows: list[dict[str, str]]) -> str:
     """One line per case."""
     return "\n".join(
         f"{r['data']:13s} {r['method']:14s} {r['method_seconds'] or '-':>8s} s {r['work_mb'] or '-':>8s} MB, "
@@ -47,7 +47,7 @@ def report(rows):
 
 
 def _reconstruct(data, method):
-    views = make_views(material.load(data))
+    views = make_views(scoring.load(data))
     how = {} if method in ("tomasi_kanade", "pta") else {"progress": False}
     baselines.tomasi_kanade(views[:20])  # libraries load on first use
     baselines.limits.LONG = _LONG  # in this process only

@@ -8,18 +8,18 @@ import torch
 from ..model import DeepNRSfM
 from ..reconstruction import reconstruct
 from ..training import PRIOR_FRAMES, learn_prior
-from .process import apart, peak_mb
+from .lab.process import apart, peak_mb
 
 QUESTION = "How many frames per second does `reconstruct` take in with a trained network, and how much memory?"
 _POINTS = 31
 
 
-def cases(quick):
+def cases(quick: bool) -> list[dict[str, object]]:
     """Number of frames, with and without the refinement of each frame."""
     return [{"frames": n, "refine": r} for r in (False, True) for n in ((1000,) if quick else (10_000, 100_000))]
 
 
-def conditions(quick):
+def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "network": "the default, 31 points, float32, a prior of eight kinds; its weights do not matter",
@@ -27,12 +27,12 @@ def conditions(quick):
     }
 
 
-def measure(frames, refine):
+def measure(frames: int, refine: bool) -> dict[str, object]:
     """Seconds and megabytes, measured in a process of its own, since a peak never goes down again."""
     return apart(_infer, frames, refine)
 
 
-def report(rows):
+def report(rows: list[dict[str, str]]) -> str:
     """One line per case."""
     return "\n".join(
         f"{int(r['frames']):7d} frames, refine={r['refine']}: {float(r['frames_per_s']):8.0f} frames/s, "

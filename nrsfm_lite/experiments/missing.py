@@ -4,7 +4,7 @@ from .. import baselines
 from ..data import Landmarks
 from ..reconstruction import reconstruct
 from ..training import fit
-from . import material
+from .lab import scoring
 
 QUESTION = "How does the error grow with the number of hidden points, and what should the encoder see in their place?"
 _HIDDEN = ("0", "1", "2", "3", "4", "5", "6", "7", "0.3", "0.5", "self")
@@ -12,7 +12,7 @@ _BETWEEN = ("1", "2", "4", "5", "6", "self")
 _METHODS = ("zero", "scaled", "completed")
 
 
-def cases(quick):
+def cases(quick: bool) -> list[dict[str, object]]:
     """Data, what is hidden, method and seed."""
     if quick:
         methods = ("likely", *_METHODS, "rigid")
@@ -24,7 +24,7 @@ def cases(quick):
     return [{"data": "martial", "hidden": h, "method": m, "seed": s} for h, m, s in rows]
 
 
-def conditions(quick):
+def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "hidden": "a whole number m: 1 to m points per frame, uniformly; a share: so many in every frame; self: "
@@ -32,31 +32,31 @@ def conditions(quick):
         "method": "likely, zero, scaled: the network, and what its encoder gets for a hidden point (Config.fill); "
         "completed: all hidden points completed first, then taken for visible; rigid: one rigid shape after completion",
         "errors": "normalised 3D error over all points; _hidden: over the hidden ones, in the same unit",
-        "steps": material.QUICK_STEPS if quick else "the default schedule's",
+        "steps": scoring.QUICK_STEPS if quick else "the default schedule's",
     }
 
 
-def measure(data, hidden, method, seed):
+def measure(data: str, hidden: str, method: str, seed: int) -> dict[str, object]:
     """Errors of one training, or of the rigid baseline."""
     missing = hidden if hidden == "self" else float(hidden) if "." in hidden else int(hidden)
     if method in ("likely", "zero", "scaled"):
-        _, result = material.train_and_score(data, seed, {"missing": missing}, fill=method)
+        _, result = scoring.train_and_score(data, seed, {"missing": missing}, fill=method)
         return result
-    train, test = material.views(data, missing=missing)
+    train, test = scoring.views(data, missing=missing)
     keys = ("seen", "unseen", "refined", "refined_unseen")
     result = {k: "" for key in keys for k in (key, f"{key}_hidden")} | {"shift": ""}
     if method == "rigid":
-        return result | material.hidden_errors("seen", baselines.tomasi_kanade(train).shapes, train)
-    net = fit(_complete(train), steps=material.quick_steps(data), seed=seed, progress=False)
+        return result | scoring.hidden_errors("seen", baselines.tomasi_kanade(train).shapes, train)
+    net = fit(_complete(train), steps=scoring.quick_steps(data), seed=seed, progress=False)
     for key, frames in (("refined", train), ("refined_unseen", test)):
         S = reconstruct(_complete(frames), model=net).shapes
-        result |= material.hidden_errors(key, S, frames)
+        result |= scoring.hidden_errors(key, S, frames)
     return result
 
 
-def report(rows):
+def report(rows: list[dict[str, str]]) -> str:
     """Mean and spread over seeds, a line per number of hidden points and method."""
-    return material.by_groups(("hidden", "method"), ("seen", "refined", "refined_hidden", "refined_unseen"), rows)
+    return scoring.by_groups(("hidden", "method"), ("seen", "refined", "refined_hidden", "refined_unseen"), rows)
 
 
 def _complete(frames):

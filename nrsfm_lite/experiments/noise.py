@@ -3,13 +3,13 @@
 import torch
 
 from .. import baselines
-from . import material
+from .lab import scoring
 
 QUESTION = "How does the error grow with the noise of the images, and what do the thresholds do about it?"
 _LEVELS = (0.0, 0.05, 0.1, 0.2, 0.3)
 
 
-def cases(quick):
+def cases(quick: bool) -> list[dict[str, object]]:
     """Data, noise, method and seed."""
     data, levels, seeds = ("motion-small", (0.2,), 1) if quick else ("martial", _LEVELS, 3)
     rows = [(n, "network", s) for s in range(seeds) for n in levels]
@@ -17,32 +17,32 @@ def cases(quick):
     return [{"data": data, "noise": n, "method": m, "seed": s} for n, m, s in rows]
 
 
-def conditions(quick):
+def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "noise": "norm of the noise over that of the centred image points, in every frame",
         "errors": "normalised 3D error against the noiseless shapes",
         "first_threshold": "mean of the first encoder threshold; active: share of positive entries of the first code",
         "pta": "rank 12, on frames in their order, each from its own camera, for which it is not made",
-        "steps": material.QUICK_STEPS if quick else "the default schedule's",
+        "steps": scoring.QUICK_STEPS if quick else "the default schedule's",
     }
 
 
-def measure(data, noise, method, seed):
+def measure(data: str, noise: float, method: str, seed: int) -> dict[str, object]:
     """Errors of one training, or of a baseline."""
     if method == "network":
-        net, result = material.train_and_score(data, seed, {"noise": noise})
+        net, result = scoring.train_and_score(data, seed, {"noise": noise})
         return {k: v for k, v in result.items() if not k.endswith("_hidden")} | _sparsity(net, data, noise)
-    train, _ = material.views(data, noise=noise)
+    train, _ = scoring.views(data, noise=noise)
     rec = baselines.tomasi_kanade(train) if method == "rigid" else baselines.pta(train)
     keys = ("seen", "unseen", "refined", "shift", "refined_unseen", "first_threshold", "active", "found_noise")
-    seen = material.hidden_errors("seen", rec.shapes, train)["seen"]
+    seen = scoring.hidden_errors("seen", rec.shapes, train)["seen"]
     return dict.fromkeys(keys, "") | {"seen": seen}
 
 
-def report(rows):
+def report(rows: list[dict[str, str]]) -> str:
     """Mean and spread over seeds, a line per level and method."""
-    return material.by_groups(
+    return scoring.by_groups(
         ("noise", "method"), ("seen", "refined", "refined_unseen", "first_threshold", "active", "found_noise"), rows
     )
 
@@ -50,7 +50,7 @@ def report(rows):
 @torch.no_grad()
 def _sparsity(net, data, noise):
     """Thresholds, active entries, and σ of the shape prior over the root mean square of image coordinates."""
-    train, _ = material.views(data, noise=noise)
+    train, _ = scoring.views(data, noise=noise)
     W = torch.as_tensor(train.points2d[::20])
     image, _, _ = net.normalize(W, torch.ones(W.shape[:2]))
     code = torch.relu(

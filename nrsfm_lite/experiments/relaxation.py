@@ -2,11 +2,11 @@
 
 from functools import partial
 
-from . import material
+from .lab import scoring
 
 QUESTION = "Is the code better read off the last blocks by the paper's six shared weights, or by a full linear map?"
 
-cases = partial(material.variants, "beta", ("full", "shared"), 3)
-conditions = partial(material.variant_conditions, "beta")
-measure = material.score_variant
-report = partial(material.compare_variants, "beta")
+cases = partial(scoring.variants, "beta", ("full", "shared"), 3)
+conditions = partial(scoring.variant_conditions, "beta")
+measure = scoring.score_variant
+report = partial(scoring.compare_variants, "beta")

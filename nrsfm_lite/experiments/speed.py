@@ -10,14 +10,14 @@ from ..gradient import backpropagate
 from ..model import DeepNRSfM
 from ..threads import use_threads
 from ..training import SCHEDULES, make_optimizers
-from .convolution import ConvolutionNet
+from .lab.convolution import ConvolutionNet
 
 QUESTION = "How far is a training step from its bare matrix products, and from the paper's convolutions?"
 _POINTS = 31
 _ROUNDS = 9
 
 
-def cases(quick):
+def cases(quick: bool) -> list[dict[str, object]]:
     """Device, threads and batch size; a GPU only where there is one."""
     batches = (32, 128) if quick else (32, 128, 512, 2048)
     rows = [{"device": "cpu", "threads": t, "batch": b} for t in ((1,) if quick else (1, 2)) for b in batches]
@@ -26,7 +26,7 @@ def cases(quick):
     return rows
 
 
-def conditions(quick):
+def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "network": "the default, 31 points, float32",
@@ -37,7 +37,7 @@ def conditions(quick):
     }
 
 
-def measure(device, threads, batch):
+def measure(device: str, threads: int, batch: int) -> dict[str, object]:
     """Milliseconds of each, and the ratios of those timed in the same round."""
     torch.manual_seed(0)
     X = torch.randn(batch, _POINTS, 2, device=device)
@@ -65,7 +65,7 @@ def measure(device, threads, batch):
     }
 
 
-def report(rows):
+def report(rows: list[dict[str, str]]) -> str:
     """The ratios, one line per case."""
     lines = []
     for r in rows:
@@ -84,7 +84,7 @@ def _package_step(X, schedule):
     optimizers = make_optimizers(net, SCHEDULES[schedule])
 
     def step():
-        backpropagate(net, X, None, size)
+        backpropagate(net, X, size=size)
         for optimizer in optimizers:
             optimizer.step()
 

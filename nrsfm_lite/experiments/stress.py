@@ -9,12 +9,12 @@ from ..data import Landmarks
 from ..model import Config
 from ..reconstruction import reconstruct
 from ..training import fit
-from . import material
+from .lab import scoring
 
 QUESTION = "Does any learning rate, batch, depth or degenerate data lead to a number that is not one?"
 
 
-def cases(quick):
+def cases(quick: bool) -> list[dict[str, object]]:
     """Kind of data, factor on the learning rates, batch and depth."""
     kinds = ("fifty frames", "flat") if quick else ("body", "fifty frames", "flat", "repeated points")
     rates, batches, depths = ((10.0,), (8,), (2, 16)) if quick else ((0.1, 1.0, 10.0), (8, 256, 2048), (2, 6, 16))
@@ -23,7 +23,7 @@ def cases(quick):
     ]
 
 
-def conditions(quick):
+def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "data": "600 frames of a generated body; fifty of them; the body pressed flat; ten points at one place",
@@ -31,11 +31,11 @@ def conditions(quick):
     }
 
 
-def measure(kind, rates, batch, depth):
+def measure(kind: str, rates: float, batch: int, depth: int) -> dict[str, object]:
     """Whether everything is finite, or the sentence that says why not; and the error, for the curious."""
     data = _data(kind)
     views = datasets.make_views(data, seed=0)
-    plan = material.default_schedule(rates, steps=material.QUICK_STEPS, batch=batch)
+    plan = scoring.default_schedule(rates, steps=scoring.QUICK_STEPS, batch=batch)
     try:
         net = fit(views, config=Config(31, depth), schedule=plan, progress=False)
         rec = reconstruct(views, model=net)
@@ -47,7 +47,7 @@ def measure(kind, rates, batch, depth):
     return {"outcome": "finite" if finite else "not finite", "refined": error}
 
 
-def report(rows):
+def report(rows: list[dict[str, str]]) -> str:
     """How often each outcome came."""
     return "\n".join(f"{n:4d} {outcome}" for outcome, n in Counter(r["outcome"] for r in rows).most_common())
 

@@ -2,11 +2,11 @@
 
 from functools import partial
 
-from . import material
+from .lab import scoring
 
 QUESTION = "Does the soft threshold, which the paper derives, do better or worse than the ReLU that it runs?"
 
-cases = partial(material.variants, "threshold", ("relu", "soft"), 5)
-conditions = partial(material.variant_conditions, "threshold")
-measure = material.score_variant
-report = partial(material.compare_variants, "threshold")
+cases = partial(scoring.variants, "threshold", ("relu", "soft"), 5)
+conditions = partial(scoring.variant_conditions, "threshold")
+measure = scoring.score_variant
+report = partial(scoring.compare_variants, "threshold")

@@ -1,12 +1,12 @@
 """The 4×2 model on images with translations, beside the 3×2 model on centred ones (chapter 13)."""
 
-from . import material
+from .lab import scoring
 
 QUESTION = "Where does the 4x2 model, which takes the images uncentred, do as well as the 3x2 model on centred ones?"
 _SHIFTS = (0.0, 1.0, 4.0)
 
 
-def cases(quick):
+def cases(quick: bool) -> list[dict[str, object]]:
     """Data, model, share of hidden points, largest translation in sizes of the object, and seed."""
     if quick:
         rows = [("3x2", 0.1, 0.0, 0), ("4x2", 0.1, 1.0, 0), ("4x2, zeros", 0.1, 1.0, 0)]
@@ -18,7 +18,7 @@ def cases(quick):
     return [{"data": data, "model": m, "hidden": h, "translation": t, "seed": s} for m, h, t, s in rows]
 
 
-def conditions(quick):
+def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "3x2": "images centred over their visible points, which takes out any translation: one case stands for all",
@@ -26,18 +26,18 @@ def conditions(quick):
         "4x2, zeros": "images as they are; zeros for hidden points, as in the paper",
         "translation": "largest shift of an image per axis, in sizes of the object",
         "shift": "mean distance of the found translations from the true ones, in sizes of the object",
-        "steps": material.QUICK_STEPS if quick else "the default schedule's",
+        "steps": scoring.QUICK_STEPS if quick else "the default schedule's",
     }
 
 
-def measure(data, model, hidden, translation, seed):
+def measure(data: str, model: str, hidden: float, translation: float, seed: int) -> dict[str, object]:
     """Errors of one training."""
     fill = "zero" if model.endswith("zeros") else "likely"
     how = {"missing": hidden, "translation_range": translation}
-    _, result = material.train_and_score(data, seed, how, translation=model != "3x2", fill=fill)
+    _, result = scoring.train_and_score(data, seed, how, translation=model != "3x2", fill=fill)
     return result
 
 
-def report(rows):
+def report(rows: list[dict[str, str]]) -> str:
     """Mean and spread over seeds, a line per model and kind of images."""
-    return material.by_groups(("model", "hidden", "translation"), ("seen", "refined", "refined_unseen", "shift"), rows)
+    return scoring.by_groups(("model", "hidden", "translation"), ("seen", "refined", "refined_unseen", "shift"), rows)

@@ -4,7 +4,7 @@ import csv
 from pathlib import Path
 
 # An installed package has no results beside it. A notebook runs in its own folder, a shell in the repository's.
-_PLACES = (Path(__file__).resolve().parents[2] / "results", Path("results"), Path("../results"))
+_PLACES = (Path(__file__).resolve().parents[3] / "results", Path("results"), Path("../results"))
 
 
 def read_results(name: str, folder: str | Path | None = None) -> list[dict[str, str]]:

@@ -4,8 +4,10 @@ Kept to compare with (`speed`, chapter 06); the package itself uses matrix produ
 """
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.nn.functional import conv2d, conv_transpose2d
+
+from ...model import DeepNRSfM
 
 
 class ConvolutionNet(nn.Module):
@@ -15,7 +17,7 @@ class ConvolutionNet(nn.Module):
     section on implementation). The weights are copied from `net`.
     """
 
-    def __init__(self, net):
+    def __init__(self, net: DeepNRSfM) -> None:
         super().__init__()
         first, *rest = (D.detach().clone() for D in net.D)
         kernels = [first.permute(1, 0, 2)[..., None], *(D[..., None, None] for D in rest)]
@@ -26,7 +28,7 @@ class ConvolutionNet(nn.Module):
             nn.Parameter(p.detach().clone()) for p in (net.beta, net.gamma, net.output_bias)
         )
 
-    def forward(self, X):
+    def forward(self, X: Tensor) -> tuple[Tensor, Tensor]:
         """Shapes (B, P, 3) and cameras (B, 3, 2) of normalised points (B, P, 2)."""
         Psi = X[:, :, None]  # (B, P, 1, 2)
         for kernel, b in zip(self.kernels, self.encoder_threshold, strict=True):

@@ -1,65 +1,39 @@
-"""What the experiments measure on, and how a network is scored: the same everywhere."""
+"""How a network is trained and scored, and how the rows are summed up: the same in every experiment."""
 
 import hashlib
-import os
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from .. import datasets, metrics, quality
-from ..model import Config
-from ..reconstruction import reconstruct
-from ..training import SCHEDULES, fit
+from ... import datasets, metrics, quality
+from ...data import Landmarks
+from ...model import Config, DeepNRSfM
+from ...reconstruction import reconstruct
+from ...training import SCHEDULES, Schedule, fit
 
-_CMU = ("salsa", "indian", "martial")
-CLASSIC = ("drink", "pickup", "yoga", "stretch", "dance")
 QUICK_STEPS = 60
 # To compare settings of the network itself: longer than the default schedule, and without its pull.
 _LONG = replace(SCHEDULES["default"], steps=2700, pull=0.0)
 
 
 @lru_cache(maxsize=4)
-def load(name):
-    """Landmarks with points3d, by name.
-
-    Generated: "motion", "motion-small", or "motion-N" with N frames. A folder of `cmu_bvh`: "martial", "salsa" or
-    "indian". A file of `classic`: "drink", "pickup", "yoga", "stretch" or "dance".
-
-    Raises FileNotFoundError, with a sentence, if real data is asked for and NRSFM_DATA does not lead to it.
-    """
-    if name == "motion":
-        return datasets.make_motion(4000, seed=0)
-    if name == "motion-small":
-        return datasets.make_motion(600, seed=0)
-    if name.startswith("motion-") and name[7:].isdigit():
-        return datasets.make_motion(int(name[7:]), seed=0)
-    if name in CLASSIC:
-        return datasets.load_classic(_real(f"classic/{name}.npz"))
-    if name not in _CMU:
-        known = ("motion", "motion-small", "motion-N", *_CMU, *CLASSIC)
-        raise KeyError(f"unknown data {name!r}; there are {', '.join(known)}.")
-    return datasets.load_bvh(_real(f"cmu_bvh/{name}"), joints=datasets.CMU_BODY)
-
-
-def _real(name):
-    """Where a file or folder of real data is."""
-    path = Path(os.environ.get("NRSFM_DATA", Path.home() / ".cache/nrsfm_lite")) / name
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: not there; set NRSFM_DATA to a folder that holds {name}.")
-    return path
+def load(name: str) -> Landmarks:
+    """`datasets.load`, kept for the next case, which mostly asks for the same again."""
+    return datasets.load(name)
 
 
 @lru_cache
-def describe(name):
+def describe(name: str) -> dict[str, int | str]:
     """Frames, points and a hash of the 3D points, so that a result can be traced to its data."""
     data = load(name)
     digest = hashlib.sha256(np.ascontiguousarray(data.points3d, dtype=np.float32).tobytes()).hexdigest()
     return {"frames": len(data), "points": data.n_points, "sha256": digest[:16]}
 
 
-def score(net, train, test):
+def score(net: DeepNRSfM, train: Landmarks, test: Landmarks) -> dict[str, float]:
     """Scores and errors of a trained network. The truth is used here, and nowhere else.
 
     Returns
@@ -68,7 +42,7 @@ def score(net, train, test):
     frames), then mean normalised 3D errors of the training frames: `seen` (one forward pass), `by_code`
     (refined by the code), `refined` (as `reconstruct` does); the same of the other frames, `unseen`,
     `by_code_unseen`, `refined_unseen`; `adapted_unseen` (the prior learned from them); and `other_hand`,
-    the share of refined training frames of the other handedness.
+    the share of refined training frames that are mirrored against the others.
     """
     result = quality.scores(net, train) | {"image_unseen": quality.image_error(net, test)}
 
@@ -83,27 +57,29 @@ def score(net, train, test):
     result["refined"], rec = error(train)
     result["refined_unseen"], _ = error(test)
     result["adapted_unseen"], _ = error(test, adapt=True)
-    result["other_hand"] = metrics.handedness(rec.shapes, train.points3d)
+    result["other_hand"] = metrics.handedness(rec.shapes, train.points3d).mirrored
     return result
 
 
-def quick_steps(data):
+def quick_steps(data: str) -> int | None:
     """How many steps to train on the small data of quick runs; None, the schedule's own, on any other."""
     return QUICK_STEPS if data == "motion-small" else None
 
 
-def default_schedule(rates=1.0, **changes):
+def default_schedule(rates: float = 1.0, **changes: object) -> Schedule:
     """The default schedule with its learning rates times a factor, and other fields changed by name."""
     plan = SCHEDULES["default"]
     return replace(plan, rate=rates * plan.rate, muon_rate=rates * plan.muon_rate, **changes)
 
 
-def views(data, **how):
+def views(data: str, **how: Any) -> tuple[Landmarks, Landmarks]:
     """Training frames (the first 80 % of the sequences) and unseen ones, each under its own random camera."""
     return datasets.make_views(load(data), seed=0, **how).split()
 
 
-def train_and_score(data, seed, how, **config):
+def train_and_score(
+    data: str, seed: int, how: dict[str, Any], **config: Any
+) -> tuple[DeepNRSfM, dict[str, float | str]]:
     """The default network on views made as `how` says, and its errors; the truth is used for these only.
 
     Returns
@@ -131,7 +107,7 @@ def train_and_score(data, seed, how, **config):
     return net, result
 
 
-def hidden_errors(key, S, frames):
+def hidden_errors(key: str, S: np.ndarray, frames: Landmarks) -> dict[str, float | str]:
     """Mean normalised error under `key`, and that of the hidden points alone under `key`_hidden."""
     whole = float(metrics.normalized_error(S, frames.points3d).mean())
     if frames.visible.all():
@@ -140,18 +116,18 @@ def hidden_errors(key, S, frames):
     return {key: whole, f"{key}_hidden": float(np.nanmean(hidden))}
 
 
-def variants(setting, values, seeds, quick):
+def variants(setting: str, values: Sequence[str], seeds: int, quick: bool) -> list[dict[str, object]]:
     """Cases of an experiment that compares the values of one setting of the network over seeds."""
     data, seeds = (["motion-small"], 1) if quick else (["motion", "martial"], seeds)
     return [{"data": d, setting: v, "seed": s} for d in data for v in values for s in range(seeds)]
 
 
-def variant_conditions(setting, quick):
+def variant_conditions(setting: str, quick: bool) -> dict[str, object]:
     """What the cases of `variants` share."""
     return {"network": f"the default, but for {setting}", "steps": QUICK_STEPS if quick else _LONG.steps}
 
 
-def score_variant(data, seed, **setting):
+def score_variant(data: str, seed: int, **setting: Any) -> dict[str, float]:
     """`score` of the default network with one setting changed."""
     config = Config(load(data).n_points, **setting)
     train, test = views(data)
@@ -159,21 +135,29 @@ def score_variant(data, seed, **setting):
     return score(net, train, test)
 
 
-def compare_variants(setting, rows):
+def compare_variants(setting: str, rows: list[dict[str, str]]) -> str:
     """Mean and spread over seeds of the errors, for each data set and value of the setting, as text."""
     return by_groups(("data", setting), ("image_error", "by_code", "by_code_unseen"), rows)
 
 
-def by_groups(keys, columns, rows):
-    """Mean ± standard deviation of some columns over the rows that agree in `keys`, a line for each group."""
+def by_groups(keys: Sequence[str], columns: Sequence[str], rows: list[dict[str, str]]) -> str:
+    """Mean ± standard deviation of some columns over the rows that agree in `keys`, a line for each group.
+
+    >>> print(by_groups(["data"], ["seen"], [{"data": "motion", "seen": "0.1"}, {"data": "motion", "seen": "0.3"}]))
+    data motion, 2 seeds: seen 0.2 ± 0.14
+    """
     groups = {}
     for row in rows:
         groups.setdefault(tuple(f"{key} {row[key]}" for key in keys), []).append(row)
     return "\n".join(f"{', '.join(g)}, {len(r)} seeds: {mean_and_spread(r, columns)}" for g, r in groups.items())
 
 
-def mean_and_spread(rows, keys):
-    """Mean ± standard deviation of some columns, as text; empty cells are left out."""
+def mean_and_spread(rows: list[dict[str, str]], keys: Sequence[str]) -> str:
+    """Mean ± standard deviation of some columns, as text; empty cells are left out.
+
+    >>> mean_and_spread([{"seen": "0.1", "shift": ""}, {"seen": "0.3", "shift": ""}], ["seen", "shift"])
+    'seen 0.2 ± 0.14, shift not measured'
+    """
     parts = []
     for key in keys:
         numbers = np.array([float(r[key]) for r in rows if r[key]])

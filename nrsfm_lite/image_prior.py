@@ -9,11 +9,12 @@ Unlike completion by low rank, which shrinks, G keeps every direction at its own
 in without asking the others.
 """
 
-import torch
+from __future__ import annotations
 
-from . import preprocessing
-from .data import as_points
-from .threads import use_threads
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
 
 _ITERATIONS = 30
 _FRAMES = 4000  # at most, drawn evenly
@@ -23,20 +24,20 @@ _DOUBT = 1e-2  # variance of a point of confidence ω, relative to the frame's h
 _CHUNK = 64
 
 
-def learn(X, visible):
+def learn(X: Tensor, weight: Tensor) -> Tensor:
     """Covariance of the points' image coordinates.
 
     Parameters
     ----------
     X : (F, P, 2) tensor, centred over the visible points, of unit scale, zero where hidden
-    visible : (F, P) tensor, bool or weights from 0 to 1; every point is visible somewhere
+    weight : (F, P) tensor, bool or from 0 to 1; every point is visible somewhere
 
     Returns
     -------
     G : (P, P) tensor in double precision; its rows sum to zero, as the centroid belongs to t.
     """
     step = -(-len(X) // _FRAMES)
-    X, weight = X[::step].double(), _relative(visible[::step].double())
+    X, weight = X[::step].double(), _relative(weight[::step].double())
     F, P, _ = X.shape
     if (weight == 1).all():
         X = X - X.mean(1, keepdim=True)
@@ -46,7 +47,7 @@ def learn(X, visible):
     for _ in range(_ITERATIONS):
         outer, known = 0.0, 0.0
         for x, w in _parts(X, weight):
-            a, precision = _look(G, x, w)
+            a, precision = _posterior(G, x, w)
             rows = (G @ a).mT.reshape(-1, P)  # what x and y are expected to be
             outer = outer + rows.T @ rows
             known = known + 2 * precision.sum(0)
@@ -55,7 +56,7 @@ def learn(X, visible):
     return G
 
 
-def fill(G, X, visible):
+def fill(G: Tensor, X: Tensor, weight: Tensor) -> Tensor:
     """Points with the hidden ones at their likely place, and each frame centred again over all its points.
 
     The visible points of a frame are taken in one after the other, each moving the expectation of all that are
@@ -64,7 +65,7 @@ def fill(G, X, visible):
     Parameters
     ----------
     G : what `learn` returns
-    X, visible : as in `learn`
+    X, weight : as in `learn`
 
     Returns
     -------
@@ -72,67 +73,36 @@ def fill(G, X, visible):
     """
     P = X.shape[1]
     filled = []
-    for x, weight in [(X, visible)] if torch.compiler.is_exporting() else _parts(X, visible):
-        x, weight = x.to(G), _relative(weight.to(G))
-        share, noise = _trust(weight)
+    for x, w in [(X, weight)] if torch.compiler.is_exporting() else _parts(X, weight):
+        x, w = x.to(G), _relative(w.to(G))
+        share, noise = _trust(w)
         mean = torch.zeros_like(x)
         Sigma = (G + _SHIFT).expand(x.shape[0], P, P)  # not len(x), which `torch.export` would fix
         for k in range(P):
             gain = share[:, k, None] * Sigma[:, :, k] / (Sigma[:, k, k] + noise[:, k])[:, None]
             mean = mean + gain[..., None] * (x[:, k] - mean[:, k])[:, None]
             Sigma = Sigma - gain[..., None] * Sigma[:, k, None]
-        filled.append(torch.where((weight == 1)[..., None], x, mean))
+        filled.append(torch.where((w == 1)[..., None], x, mean))
     filled = torch.cat(filled)
     return (filled - filled.mean(1, keepdim=True)).to(X.dtype)
 
 
-def complete(W, visible=None):
-    """Image points with the hidden ones filled in, the visible ones as they are, for methods that need every point.
-
-    Parameters
-    ----------
-    W : Landmarks, or (F, P, 2) array of image points
-    visible : (F, P) bool, optional
-
-    Returns
-    -------
-    (F, P, 2) array
-
-    Raises
-    ------
-    ValueError
-        As `as_points`; also if a point is hidden in every frame, or all visible points are at one place.
-    """
-    W, visible, names, _ = as_points(W, visible)
-    if visible.all():
-        return W
-    W, seen = torch.as_tensor(W), torch.as_tensor(visible)
-    preprocessing.check_points(seen, names)
-    preprocessing.check_extent(W, seen)
-    X, _ = preprocessing.center(W, seen)
-    scale = preprocessing.set_scale(X, seen)
-    with use_threads(1):
-        filled = fill(learn(X / scale, seen), X / scale, seen) * scale
-    moved = preprocessing.visible_mean(W - filled, seen)  # back to where the visible points are
-    return torch.where(seen[..., None], W, filled + moved[:, None]).numpy()
-
-
-def _parts(X, visible):
+def _parts(X: Tensor, weight: Tensor) -> Iterable[tuple[Tensor, Tensor]]:
     """A few frames at a time, so that their matrices stay in the cache."""
-    return zip(X.split(_CHUNK), visible.split(_CHUNK), strict=True)
+    return zip(X.split(_CHUNK), weight.split(_CHUNK), strict=True)
 
 
-def _relative(weight):
+def _relative(weight: Tensor) -> Tensor:
     """Weights relative to the frame's largest: doubt about all points alike says nothing about where one is."""
     return weight / weight.amax(1, keepdim=True).clamp(min=1e-12)
 
 
-def _trust(weight):
+def _trust(weight: Tensor) -> tuple[Tensor, Tensor]:
     """One where visible, else zero; and the variance of each point's noise."""
     return (weight > 0).to(weight), _NOISE + _DOUBT * (1 / torch.where(weight > 0, weight, 1.0) - 1)
 
 
-def _look(G, X, weight):
+def _posterior(G: Tensor, X: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Σ⁻¹ x and Σ⁻¹ for the visible rows of each frame, zero elsewhere; Σ = G + shift + noise."""
     share, noise = _trust(weight)
     both = share[:, :, None] * share[:, None]

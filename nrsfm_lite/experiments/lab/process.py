@@ -4,16 +4,22 @@ import multiprocessing
 import os
 import resource
 import sys
+from collections.abc import Callable
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # read when the libraries load
 
 
-def apart(function, *arguments, one_thread=False):
+def apart(function: Callable[..., Any], *arguments: Any, one_thread: bool = False) -> Any:
     """function(*arguments), a module's function, computed in a fresh process, of one thread if wanted.
 
     Raises RuntimeError if that process ends without a result.
+
+    >>> apart(math.sqrt, 9.0)
+    3.0
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
@@ -29,8 +35,12 @@ def apart(function, *arguments, one_thread=False):
         child.join()
 
 
-def peak_mb():
-    """Largest memory that this process has ever held, in megabytes."""
+def peak_mb() -> float:
+    """Largest memory that this process has ever held, in megabytes.
+
+    >>> peak_mb() > 1
+    True
+    """
     status = Path("/proc/self/status")
     if status.exists():  # getrusage would count what the parent held, too
         (line,) = [line for line in status.read_text().splitlines() if line.startswith("VmHWM")]
@@ -39,5 +49,5 @@ def peak_mb():
     return peak / 1e6 if sys.platform == "darwin" else peak / 1e3
 
 
-def _send(pipe, function, arguments):
+def _send(pipe: Connection, function: Callable[..., Any], arguments: tuple) -> None:
     pipe.send(function(*arguments))

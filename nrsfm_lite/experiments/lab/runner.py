@@ -1,6 +1,6 @@
 """Runs an experiment case by case and keeps what it measured, with all that is needed to trust it.
 
-An experiment is a module of this package with
+An experiment is a module of `nrsfm_lite.experiments` with
 
     QUESTION               one sentence: what is asked
     cases(quick)           list of dicts: all that decides a row, such as data, setting and seed
@@ -18,22 +18,22 @@ import os
 import platform
 import subprocess
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-
-import torch
-
-from . import material
 
 NAMES = (
     *("speed", "inference", "thresholds", "relaxation", "training", "coherence", "stress", "unseen"),
     *("missing", "translation", "noise", "classic", "growth"),
 )
 _LIBRARIES = ("torch", "numpy", "scipy")
+_EXPERIMENTS = __package__.rpartition(".")[0]
 
 
-def run(name, quick=False, folder=None, say=print):
+def run(
+    name: str, *, quick: bool = False, folder: str | Path | None = None, say: Callable[[str], object] = print
+) -> list[dict[str, str]]:
     """Do what is left of an experiment, and return all its rows.
 
     Every finished case is written at once, whole or not at all, so a run may be stopped at any time
@@ -62,10 +62,14 @@ def run(name, quick=False, folder=None, say=print):
         If the CSV in the folder has other columns.
     FileNotFoundError
         If real data is needed and not there.
+
+    Examples
+    --------
+    >>> rows = nl.experiments.run("stress", quick=True)
     """
     if name not in NAMES:
         raise KeyError(f"unknown experiment {name!r}; there are {', '.join(NAMES)}.")
-    experiment = importlib.import_module(f".{name}", __package__)
+    experiment = importlib.import_module(f".{name}", _EXPERIMENTS)
     asked = experiment.cases(quick)
     cases = [{key: _text(value) for key, value in case.items()} for case in asked]
     folder = Path(folder or ("_build/results" if quick else "results"))
@@ -127,6 +131,8 @@ def _write_table(path, rows):
 
 def _write_origin(path, name, experiment, quick, rows, this_run):
     """Where the rows come from: conditions, data and their hashes, and every run that added some."""
+    from . import scoring  # here: whoever only asks for the names of the experiments must not wait for PyTorch
+
     before = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     runs = [r for r in before.get("runs", []) if r["started"] != this_run["started"]]
     data = sorted({row["data"] for row in rows if "data" in row})
@@ -135,7 +141,7 @@ def _write_origin(path, name, experiment, quick, rows, this_run):
         "question": experiment.QUESTION,
         "command": f"nrsfm experiment {name}" + (" --quick" if quick else ""),
         "conditions": experiment.conditions(quick),
-        "data": {d: material.describe(d) for d in data},
+        "data": {d: scoring.describe(d) for d in data},
         "runs": [*runs, this_run],
     }
     part = path.with_name(path.name + ".part")
@@ -152,8 +158,10 @@ def _circumstances():
     }
 
 
-def device_name():
+def device_name() -> str:
     """The processor and, if there is one, the GPU, in words."""
+    import torch  # here for the same reason as in `_write_origin`
+
     name = platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -165,13 +173,13 @@ def device_name():
 
 def _commit():
     """The checkout's commit, with '+' if files have changed since; None outside a checkout."""
-    here = Path(__file__).parent
+    package = Path(__file__).parents[2]
 
     def git(*words):
-        return subprocess.run(["git", *words], cwd=here, capture_output=True, text=True, check=True).stdout.strip()
+        return subprocess.run(["git", *words], cwd=package, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "--", "..") else "")
+        return git("rev-parse", "--short", "HEAD") + ("+" if git("status", "--porcelain", "--", ".") else "")
     except (OSError, subprocess.CalledProcessError):
         return None
 
