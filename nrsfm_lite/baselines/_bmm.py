@@ -115,7 +115,7 @@ def _least_nuclear_norm(X: np.ndarray, M: np.ndarray, rank: int, watch: Watch) -
         for _ in range(_ITERATIONS):
             S = ahead.reshape(F, P, 3)
             new = _shrink((S - (S @ M - X) @ M.swapaxes(1, 2)).reshape(F, 3 * P), mu)
-            change = np.linalg.norm(new - A) / max(1, np.linalg.norm(A))
+            change = np.linalg.norm(new - A) / max(1, float(np.linalg.norm(A)))
             if ((ahead - new) * (new - A)).sum() > 0:  # the momentum points uphill: start it anew
                 momentum = 1.0
             momentum, share = nesterov(momentum)

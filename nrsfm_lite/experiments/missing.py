@@ -44,7 +44,7 @@ def measure(data: str, hidden: str, method: str, seed: int) -> dict[str, object]
         return result
     train, test = scoring.views(data, missing=missing)
     keys = ("seen", "unseen", "refined", "refined_unseen")
-    result = {k: "" for key in keys for k in (key, f"{key}_hidden")} | {"shift": ""}
+    result: dict[str, object] = {k: "" for key in keys for k in (key, f"{key}_hidden")} | {"shift": ""}
     if method == "rigid":
         return result | scoring.hidden_errors("seen", baselines.tomasi_kanade(train).shapes, train)
     net = fit(_complete(train), steps=scoring.quick_steps(data), seed=seed, progress=False)
