@@ -80,8 +80,8 @@ class Landmarks:
 
     points2d: np.ndarray | None = None
     visible: np.ndarray | None = None
-    _: KW_ONLY
     confidence: np.ndarray | None = None
+    _: KW_ONLY
     points3d: np.ndarray | None = None
     cameras: np.ndarray | None = None
     translations: np.ndarray | None = None
@@ -372,14 +372,14 @@ def _html(text: str, points: np.ndarray, visible: np.ndarray, edges: np.ndarray,
     )
     reach = (high - low).max() or 1.0
     points = side / 2 + 0.9 * side * (points - (low + high)[:, None] / 2) / reach * (1, -1)
-    path = ""
+    lines = spots = ""
     for i, (frame, seen) in enumerate(zip(points, shown, strict=True)):
         at = [f"{x + i * side:.0f} {y:.0f}" if s else "" for (x, y), s in zip(frame, seen, strict=True)]
-        path += "".join(f"M{at[a]}L{at[b]}" for a, b in edges if seen[a] and seen[b])
-        path += "".join(f"M{at[p]}h0" for p in dots if seen[p])  # a line of no length with round ends is a dot
+        lines += "".join(f"M{at[a]}L{at[b]}" for a, b in edges if seen[a] and seen[b])
+        spots += "".join(f"M{at[p]}h0" for p in dots if seen[p])  # a line of no length with round ends is a dot
     width = n_frames * side
     return (
         f'{text}<svg width="{width}" height="{side}" viewBox="0 0 {width} {side}" role="img" '
-        f'aria-label="{n_frames} of the frames">'
-        f'<path d="{path}" fill="none" stroke="{colour}" stroke-width="2.5" stroke-linecap="round"/></svg>'
+        f'aria-label="{n_frames} of the frames" fill="none" stroke="{colour}" stroke-linecap="round">'
+        f'<path d="{lines}" stroke-width="1.5"/><path d="{spots}" stroke-width="4"/></svg>'
     )

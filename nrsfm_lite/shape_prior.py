@@ -166,7 +166,7 @@ def _without_noise(gaussian):
     values, vectors = torch.linalg.eigh(gaussian.covariance)
     flat = 2 * values[3:].quantile(0.1).clamp(min=0)  # the first three belong to the centroid
     C = (vectors * (values - flat).clamp(min=0)) @ vectors.T
-    least = 1e-7 * float(values[-1])  # what rounding to single precision, in which networks keep it, may do to C
+    least = 1e-7 * float(values[-1])  # of images of single precision nothing finer can be said
     return Gaussian(gaussian.mean, C, max(gaussian.noise + float(flat), least))
 
 

@@ -274,9 +274,9 @@ def learn_normalizer(
     untrained: normalizer.Normalizer, W: Tensor, mean: Tensor, weight: Tensor
 ) -> normalizer.Normalizer:
     """The way into a network's units for training frames W, centred, in double precision."""
-    found = replace(untrained, scale=float(normalizer.set_scale(W, weight).float()), origin=mean.mean(0).float())
+    found = replace(untrained, scale=float(normalizer.set_scale(W, weight)), origin=mean.mean(0))
     X = W / found.unit(W, weight)[:, None, None]
-    return replace(found, covariance=image_prior.learn(X, weight).float().double())
+    return replace(found, covariance=image_prior.learn(X, weight))
 
 
 @torch.no_grad()
@@ -296,11 +296,7 @@ def learn_prior(
     """
     pick = torch.randperm(len(X), generator=random)[:PRIOR_FRAMES]
     _, S, M = net.lift(image[pick].to(net.device))
-    prior = shape_prior.learn(X[pick], weight[pick], S.cpu(), M.cpu())
-    return tuple(
-        shape_prior.Gaussian(g.mean.float().double(), g.covariance.float().double(), float(torch.tensor(g.noise)))
-        for g in prior
-    )
+    return shape_prior.learn(X[pick], weight[pick], S.cpu(), M.cpu())
 
 
 class Descent:

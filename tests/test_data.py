@@ -226,7 +226,7 @@ def test_small_pictures_of_landmarks_and_reconstructions(rng):
     for source in (motion, views, rec, many):
         page = source._repr_html_()
         ElementTree.fromstring(f"<p>{page}</p>")  # well formed
-        assert len(page) < 10_000 and page.count("<path") == 1 and "M" in page
+        assert len(page) < 10_000 and page.count("<path") == 2 and "M" in page
         assert not re.search(r"nan|inf|href|src|script", page)
     assert views._repr_html_().count("h0") == views.visible[[0, 15, 30, 44, 59]].sum(), "a dot for each visible point"
     named = nl.Landmarks(points2d=np.zeros((1, 1, 2)), name="<script>")._repr_html_()

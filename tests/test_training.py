@@ -175,7 +175,7 @@ def one_place():
         (one_place(), {}, "frame 3 of W has all its visible points at one place"),
         (one_place()[:2], {}, "at least 10 frames and 4 points; got 2 frames of 6 points"),
         (one_place()[:, :3], {}, "got 20 frames of 3 points"),
-        (np.ones((20, 6, 2)), {"config": nl.Config(5)}, "config.n_points is 5"),
+        (np.arange(240.0).reshape(20, 6, 2), {"config": nl.Config(5)}, "config.n_points is 5"),
         (np.ones((20, 6, 2)), {"schedule": "fast"}, "schedule='fast'"),
         (np.ones((20, 6, 2)), {"steps": 0}, "steps=0"),
     ],
