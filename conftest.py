@@ -29,11 +29,14 @@ _times = defaultdict(float)
 @pytest.fixture(autouse=True, scope="session")
 def _names_of_the_examples(doctest_namespace):
     """What the examples in docstrings may use without importing it."""
+    import matplotlib
     import numpy as np
+    import torch
 
     import nrsfm_lite as nl
 
-    doctest_namespace.update(nl=nl, np=np)
+    matplotlib.use("Agg")  # no window opens. Not as an environment variable: the notebooks' kernels would inherit it
+    doctest_namespace.update(nl=nl, np=np, torch=torch)
 
 
 def pytest_configure(config):

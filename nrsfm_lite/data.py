@@ -102,13 +102,13 @@ class Landmarks:
             self.visible = np.ones((n_frames, n_points), bool)
         if self.sequence is None:
             self.sequence = np.zeros(n_frames, int)
-        sizes: dict[str | int, int] = {"F": n_frames, "P": n_points}
+        sizes = {"F": n_frames, "P": n_points}
         for key, (axes, dtype) in _FRAME_ARRAYS.items():
             value = getattr(self, key)
             if value is None:
                 continue
             value = checks.as_array(key, value, dtype)
-            checks.check_shape(key, value, tuple(sizes.get(a, a) for a in axes))
+            checks.check_shape(key, value, tuple(a if isinstance(a, int) else sizes[a] for a in axes))
             setattr(self, key, value)
         if self.points2d is not None:
             checks.check_visible_finite("points2d", self.points2d, self.visible)

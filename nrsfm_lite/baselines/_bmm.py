@@ -122,7 +122,7 @@ def _least_nuclear_norm(X: np.ndarray, M: np.ndarray, rank: int, watch: Watch) -
             ahead, A = new + share * (new - A), new
             if change < _TOLERANCE or watch.over:
                 break
-        levels += change < _TOLERANCE
+        levels += int(change < _TOLERANCE)
     return _cut(A, rank).reshape(F, P, 3), levels == _LEVELS
 
 

@@ -9,8 +9,8 @@ from ..training import fit
 from .lab import scoring
 
 QUESTION = "Does the coherence of the last dictionary, or any other score without ground truth, rank networks?"
-SCORES: tuple[str, ...] = ("coherence", "image_error", "consistency", "turn_consistency", "distortion", "code_dimension")
-SCORES += ("negative_log_likelihood", "image_unseen")
+SCORES: tuple[str, ...] = ("coherence", "image_error", "consistency", "turn_consistency", "distortion")
+SCORES += ("code_dimension", "negative_log_likelihood", "image_unseen")
 _LOOKS = 12  # at a network while it trains
 _FRAMES = 1000  # of each look
 _SETTINGS: dict[str, dict[str, float]] = {

@@ -77,9 +77,7 @@ def views(data: str, **how: Any) -> tuple[Landmarks, Landmarks]:
     return datasets.make_views(load(data), seed=0, **how).split()
 
 
-def train_and_score(
-    data: str, seed: int, how: dict[str, Any], **config: Any
-) -> tuple[DeepNRSfM, dict[str, Any]]:
+def train_and_score(data: str, seed: int, how: dict[str, Any], **config: Any) -> tuple[DeepNRSfM, dict[str, Any]]:
     """The default network on views made as `how` says, and its errors; the truth is used for these only.
 
     Returns
