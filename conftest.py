@@ -29,6 +29,8 @@ _times = defaultdict(float)
 @pytest.fixture(autouse=True, scope="session")
 def _names_of_the_examples(doctest_namespace):
     """What the examples in docstrings may use without importing it."""
+    import math
+
     import matplotlib
     import numpy as np
     import torch
@@ -36,7 +38,7 @@ def _names_of_the_examples(doctest_namespace):
     import nrsfm_lite as nl
 
     matplotlib.use("Agg")  # no window opens. Not as an environment variable: the notebooks' kernels would inherit it
-    doctest_namespace.update(nl=nl, np=np, torch=torch)
+    doctest_namespace.update(nl=nl, np=np, torch=torch, math=math)
 
 
 def pytest_configure(config):
