@@ -1,8 +1,13 @@
 # The only entry points. Each target makes the environment first if it is missing.
-PY ?= python3
+# The Python that the environment is made of: python3 if it will do, else the newest that does. PY=… decides otherwise.
+PY ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && echo $$p && break; done)
+JOBS ?= 2
 BIN := .venv/bin
 READY := .venv/.ready
 CACHE := _build/.jupyter_cache
+# A file's tests, and a notebook's cells, stay in one process; the files go out in the order of conftest.py.
+PARALLEL = -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 help:            ## list the targets
 	@grep -E '^[a-z]+: .*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 10
@@ -14,11 +19,17 @@ book: $(READY)   ## build the book into _build/html; runs only notebooks that `m
 	@$(BIN)/jupyter-book build . --toc book/_toc.yml --quiet -W --keep-going --all
 	@echo "Open _build/html/index.html"
 
-test: $(READY)   ## check the style, test the package, execute every notebook once
-	@echo "Testing the package and executing the notebooks …"
+test: $(READY)   ## check style and types, test the package, execute every notebook once; JOBS=4 for four processes
+	@echo "Checking style and types …"
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/ruff format --check --quiet .
-	@$(BIN)/python -m pytest -q
+	@$(BIN)/mypy --no-error-summary
+	@echo "Testing the package and executing the notebooks …"
+	@$(BIN)/python -m pytest -q $(PARALLEL)
+
+kernels: $(READY) ## test the package twice more, with the linear algebra of two older processors
+	@echo "Testing under other kernels …"
+	@$(BIN)/python tests/kernels.py $(PARALLEL)
 
 lab: $(READY)    ## open the notebooks in JupyterLab
 	@echo "Opening JupyterLab …"
@@ -38,14 +49,15 @@ picture: $(READY) ## remake book/_static/reconstruction.png, the picture of the 
 
 clean:           ## remove the environment and everything built
 	@echo "Removing .venv and _build …"
-	@rm -rf .venv _build build *.egg-info book/_ext/*.egg-info book/_ext/build .pytest_cache .ruff_cache
+	@rm -rf .venv _build build *.egg-info book/_ext/*.egg-info book/_ext/build .pytest_cache .ruff_cache .hypothesis
 
 $(READY): requirements.txt pyproject.toml book/_ext/pyproject.toml
-	@$(PY) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if v >= (3, 11) else f"Python 3.11 or newer is needed, this is {v[0]}.{v[1]}; try: make PY=python3.11")'
+	@[ -n "$(PY)" ] || { echo "Python 3.11, 3.12 or 3.13 is needed, and none was found. Name one: make PY=/path/to/python3.13"; exit 1; }
+	@$(PY) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v <= (3, 13) else f"Python 3.11, 3.12 or 3.13 is needed, this is {v[0]}.{v[1]}. Try: make PY=python3.13")'
 	@echo "Making the environment in .venv (once, a few minutes) …"
 	@$(PY) -m venv .venv
 	@if [ -n "$(TORCH_INDEX)" ]; then $(BIN)/pip install --quiet --index-url $(TORCH_INDEX) "$$(grep '^torch==' requirements.txt)"; fi
 	@$(BIN)/pip install --quiet -r requirements.txt
 	@touch $@
 
-.PHONY: help book test lab bench site picture clean
+.PHONY: help book test kernels lab bench site picture clean

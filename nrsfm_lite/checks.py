@@ -21,7 +21,7 @@ def as_array(name: str, value: Any, dtype: type) -> np.ndarray:
         if np.iscomplexobj(value):
             raise ValueError  # NumPy would drop the imaginary part with a warning only
         with np.errstate(invalid="ignore"):  # NaN as a whole number: refused in the next line
-            array = np.array(value, dtype)
+            array: np.ndarray = np.array(value, dtype)
         if dtype is not float and not np.array_equal(np.asarray(value, float), array):
             raise ValueError
     except (TypeError, ValueError, OverflowError):

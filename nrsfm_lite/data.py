@@ -102,12 +102,13 @@ class Landmarks:
             self.visible = np.ones((n_frames, n_points), bool)
         if self.sequence is None:
             self.sequence = np.zeros(n_frames, int)
+        sizes = {"F": n_frames, "P": n_points}
         for key, (axes, dtype) in _FRAME_ARRAYS.items():
             value = getattr(self, key)
             if value is None:
                 continue
             value = checks.as_array(key, value, dtype)
-            checks.check_shape(key, value, tuple({"F": n_frames, "P": n_points}.get(a, a) for a in axes))
+            checks.check_shape(key, value, tuple(a if isinstance(a, int) else sizes[a] for a in axes))
             setattr(self, key, value)
         if self.points2d is not None:
             checks.check_visible_finite("points2d", self.points2d, self.visible)
@@ -285,7 +286,7 @@ class Reconstruction:
         arrays = read_npz(path)
         if not {"shapes", "cameras"} <= arrays.keys():
             raise ValueError(f"{path}: not a saved reconstruction (it has {', '.join(sorted(arrays)) or 'nothing'}).")
-        values = {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
+        values: dict[str, Any] = {f.name: arrays[f.name] for f in fields(cls) if f.name in arrays}
         if "config" in arrays:
             weights = {k.removeprefix("model/"): v for k, v in arrays.items() if k.startswith("model/")}
             try:

@@ -45,7 +45,7 @@ def learn(X: Tensor, weight: Tensor) -> Tensor:
         return rows.T @ rows / (2 * F)
     G = torch.eye(P, dtype=X.dtype, device=X.device) - 1 / P
     for _ in range(_ITERATIONS):
-        outer, known = 0.0, 0.0
+        outer = known = torch.zeros_like(G)
         for x, w in _parts(X, weight):
             a, precision = _posterior(G, x, w)
             rows = (G @ a).mT.reshape(-1, P)  # what x and y are expected to be
@@ -83,8 +83,8 @@ def fill(G: Tensor, X: Tensor, weight: Tensor) -> Tensor:
             mean = mean + gain[..., None] * (x[:, k] - mean[:, k])[:, None]
             Sigma = Sigma - gain[..., None] * Sigma[:, k, None]
         filled.append(torch.where((w == 1)[..., None], x, mean))
-    filled = torch.cat(filled)
-    return (filled - filled.mean(1, keepdim=True)).to(X.dtype)
+    whole = torch.cat(filled)
+    return (whole - whole.mean(1, keepdim=True)).to(X.dtype)
 
 
 def _parts(X: Tensor, weight: Tensor) -> Iterable[tuple[Tensor, Tensor]]:

@@ -351,7 +351,7 @@ class DeepNRSfM(nn.Module):
             tensors = {key: torch.as_tensor(value) for key, value in arrays.items()}
             own = {key: value for key, value in tensors.items() if "/" not in key}
             net.to(own["gamma"].dtype).load_state_dict(own)
-            found = {key: tensors[f"normalizer/{key}"] for key in ("scale", "origin", "covariance")}
+            found: dict[str, Any] = {key: tensors[f"normalizer/{key}"] for key in ("scale", "origin", "covariance")}
             settings = {key: getattr(net.config, key) for key in ("projection", "fill", "translation")}
             net.normalizer = Normalizer(**settings, **found | {"scale": float(found["scale"])})
             n = len({key.split("/")[1] for key in tensors if key.startswith("prior/")})

@@ -29,7 +29,8 @@ def use_style() -> None:
     """
     plt.rcParams.update(
         {
-            **{f"{part}.facecolor": "none" for part in ("figure", "axes", "savefig", "legend")},
+            # Matplotlib's types list the keys, and these are put together from parts.
+            **{f"{part}.facecolor": "none" for part in ("figure", "axes", "savefig", "legend")},  # type: ignore[misc]
             **{key: INK for key in ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")},
             "axes.spines.top": False,
             "axes.spines.right": False,

@@ -378,7 +378,8 @@ class Descent:
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a `state`."""
         self.net.load_state_dict(state["net"])
-        for part, saved in zip([*self.optimizers, *self.rates], [*state["optimizers"], *state["rates"]], strict=True):
+        parts: list[Any] = [*self.optimizers, *self.rates]
+        for part, saved in zip(parts, [*state["optimizers"], *state["rates"]], strict=True):
             part.load_state_dict(saved)
         self.random.set_state(state["random"])
 

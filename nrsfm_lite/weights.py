@@ -39,6 +39,6 @@ def to_onnx(net: torch.nn.Module, W: torch.Tensor, path: str | Path) -> Path:
     visible = torch.ones(W.shape[:2], dtype=torch.bool, device=W.device)
     frames = {0: torch.export.Dim("frames", min=1)}
     program = torch.export.export(net, (W, visible), dynamic_shapes=(frames, frames))
-    names = {"input_names": ["W", "visible"], "output_names": ["S", "M", "t"]}
+    names: dict[str, Any] = {"input_names": ["W", "visible"], "output_names": ["S", "M", "t"]}
     torch.onnx.export(program, dynamo=True, verbose=False, **names).save(str(path))
     return Path(path)

@@ -309,7 +309,7 @@ def _atom_system(r: np.ndarray, s: _State, problem: _Problem, damping: float) ->
     K = len(s.atoms)
     planes = s.cameras @ s.cameras.swapaxes(1, 2)  # (F, 3, 3)
     products = np.einsum("fk,fl,fij->fkilj", s.coefficients, s.coefficients, planes).reshape(F, -1)
-    matrix = np.zeros((K, P, 3, K, P, 3))
+    matrix: np.ndarray = np.zeros((K, P, 3, K, P, 3))
     point = np.arange(P)
     matrix[:, point, :, :, point, :] = (products.T @ problem.weight).T.reshape(P, K, 3, K, 3)
     matrix = matrix.reshape(3 * K * P, -1)

@@ -143,7 +143,7 @@ def _best(
         B, cameras, definite = _upgrade(U, support, codes)
         M, B, glued = _glue(B, cameras, support, codes, definite, rng)
         S = _shapes(B, M, support, X)
-        error = np.linalg.norm(X - S @ M) / np.linalg.norm(X)
+        error = float(np.linalg.norm(X - S @ M) / np.linalg.norm(X))
         if error < least:
             best, least = (S, M, settled and glued and not watch.over), error
         if least < _GOOD:
@@ -219,7 +219,7 @@ def _glue(
 
 def _fit(
     j: int,
-    frames: tuple[np.ndarray, np.ndarray],
+    frames: tuple[np.ndarray, ...],
     cameras: np.ndarray,
     M: np.ndarray,
     known: np.ndarray,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,7 +48,7 @@ def load_npz(path: str | Path) -> Landmarks:
         with np.load(path, allow_pickle=False) as archive:
             found = ", ".join(sorted(archive.files)) or "nothing"
         raise KeyError(f"{path}: needs an array points2d (or W) or points3d (or S); it has {found}.")
-    chosen = {key: arrays[key] for key in _KEYS if key in arrays}
+    chosen: dict[str, Any] = {key: arrays[key] for key in _KEYS if key in arrays}
     try:
         return Landmarks(**chosen, name=str(arrays.get("name", path.stem)))
     except ValueError as error:

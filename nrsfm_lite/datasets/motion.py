@@ -223,7 +223,8 @@ def make_motion(n_frames: int = 4000, seed: int = 0, *, actions: Sequence[str] |
     n_sequences = max(1, round(n_frames / _SEQUENCE))
     lengths = [len(part) for part in np.array_split(np.arange(n_frames), n_sequences)]
     shuffle = np.random.default_rng([seed, 0])
-    motions, deck = [], []
+    motions = []
+    deck: list[str] = []
     for i, length in enumerate(lengths):
         n_actions = -(-length // _PER_ACTION)
         while len(deck) < n_actions:

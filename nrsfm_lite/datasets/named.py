@@ -73,7 +73,7 @@ def data_folder() -> Path:
 def _loaded(path: Path | None, kind: int | str) -> Landmarks:
     """What stands behind a name: a motion of so many frames, or a file or folder of some format."""
     if path is None:
-        return make_motion(kind, seed=0)
+        return make_motion(int(kind), seed=0)
     if kind == "bvh":
         return load_bvh(path, joints=CMU_BODY)
     return load_classic(path) if kind == "classic" else load_npz(path)

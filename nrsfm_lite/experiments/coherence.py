@@ -9,11 +9,16 @@ from ..training import fit
 from .lab import scoring
 
 QUESTION = "Does the coherence of the last dictionary, or any other score without ground truth, rank networks?"
-SCORES = ("coherence", "image_error", "consistency", "turn_consistency", "distortion", "code_dimension")
-SCORES += ("negative_log_likelihood", "image_unseen")
+SCORES: tuple[str, ...] = ("coherence", "image_error", "consistency", "turn_consistency", "distortion")
+SCORES += ("code_dimension", "negative_log_likelihood", "image_unseen")
 _LOOKS = 12  # at a network while it trains
 _FRAMES = 1000  # of each look
-_SETTINGS = {"default": {}, "half rates": {"rates": 0.5}, "double rates": {"rates": 2}, "no pull": {"pull": 0.0}}
+_SETTINGS: dict[str, dict[str, float]] = {
+    "default": {},
+    "half rates": {"rates": 0.5},
+    "double rates": {"rates": 2},
+    "no pull": {"pull": 0.0},
+}
 
 
 def cases(quick: bool) -> list[dict[str, object]]:
@@ -69,7 +74,7 @@ def rank_within(rows: list[dict[str, str]], score: str) -> dict[str, float]:
     """The same over the looks at one network, mean over the networks of a data set: {data: rho}."""
     result = {}
     for data in dict.fromkeys(r["data"] for r in rows):
-        runs = {}
+        runs: dict[tuple[str, str], list[tuple[float, float]]] = {}
         for r in rows:
             if r["data"] == data and r[score] != "nan":
                 runs.setdefault((r["setting"], r["seed"]), []).append((float(r[score]), float(r["seen"])))

@@ -3,7 +3,7 @@
 import time
 
 from .. import baselines, metrics
-from ..baselines.limits import TooLarge
+from ..baselines.shared.limits import TooLarge
 from ..datasets import make_views
 from .lab import scoring
 from .lab.process import apart, peak_mb

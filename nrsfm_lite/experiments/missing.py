@@ -40,11 +40,11 @@ def measure(data: str, hidden: str, method: str, seed: int) -> dict[str, object]
     """Errors of one training, or of the rigid baseline."""
     missing = hidden if hidden == "self" else float(hidden) if "." in hidden else int(hidden)
     if method in ("likely", "zero", "scaled"):
-        _, result = scoring.train_and_score(data, seed, {"missing": missing}, fill=method)
-        return result
+        return scoring.train_and_score(data, seed, {"missing": missing}, fill=method)[1]
     train, test = scoring.views(data, missing=missing)
     keys = ("seen", "unseen", "refined", "refined_unseen")
-    result = {k: "" for key in keys for k in (key, f"{key}_hidden")} | {"shift": ""}
+    names = [*(k for key in keys for k in (key, f"{key}_hidden")), "shift"]
+    result: dict[str, object] = {name: "" for name in names}
     if method == "rigid":
         return result | scoring.hidden_errors("seen", baselines.tomasi_kanade(train).shapes, train)
     net = fit(_complete(train), steps=scoring.quick_steps(data), seed=seed, progress=False)

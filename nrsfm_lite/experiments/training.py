@@ -44,7 +44,7 @@ def measure(schedule: str, data: str, seed: int) -> dict[str, object]:
     train_seconds = time.perf_counter() - start
     start = time.perf_counter()
     reconstruct(train, model=net)
-    seconds = {"train_seconds": train_seconds, "refine_seconds": time.perf_counter() - start}
+    seconds: dict[str, object] = {"train_seconds": train_seconds, "refine_seconds": time.perf_counter() - start}
     return seconds | scoring.score(net, train, test)
 
 

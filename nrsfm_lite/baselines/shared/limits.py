@@ -45,8 +45,8 @@ class Watch:
 
     def steps(self, things: Iterable[Thing] | int, what: str) -> Iterator[Thing | int]:
         """The items of `things` (or of range(things)) until they or the time are over; the first one always."""
-        things = range(things) if isinstance(things, int) else things
-        bar = tqdm(things, desc=f"{self.method}: {what}", disable=not self.progress, leave=False)
+        items: Iterable[Thing | int] = range(things) if isinstance(things, int) else things
+        bar = tqdm(items, desc=f"{self.method}: {what}", disable=not self.progress, leave=False)
         for thing in bar:
             yield thing
             if self.over:

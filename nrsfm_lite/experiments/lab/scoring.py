@@ -66,7 +66,7 @@ def quick_steps(data: str) -> int | None:
     return QUICK_STEPS if data == "motion-small" else None
 
 
-def default_schedule(rates: float = 1.0, **changes: object) -> Schedule:
+def default_schedule(rates: float = 1.0, **changes: Any) -> Schedule:
     """The default schedule with its learning rates times a factor, and other fields changed by name."""
     plan = SCHEDULES["default"]
     return replace(plan, rate=rates * plan.rate, muon_rate=rates * plan.muon_rate, **changes)
@@ -77,9 +77,7 @@ def views(data: str, **how: Any) -> tuple[Landmarks, Landmarks]:
     return datasets.make_views(load(data), seed=0, **how).split()
 
 
-def train_and_score(
-    data: str, seed: int, how: dict[str, Any], **config: Any
-) -> tuple[DeepNRSfM, dict[str, float | str]]:
+def train_and_score(data: str, seed: int, how: dict[str, Any], **config: Any) -> tuple[DeepNRSfM, dict[str, Any]]:
     """The default network on views made as `how` says, and its errors; the truth is used for these only.
 
     Returns
@@ -92,7 +90,7 @@ def train_and_score(
     train, test = views(data, **how)
     settings = Config(train.n_points, **config)
     net = fit(train, config=settings, steps=quick_steps(data), seed=seed, progress=False)
-    result = {}
+    result: dict[str, Any] = {}
     for key, frames, refine in [
         ("seen", train, False),
         ("unseen", test, False),
@@ -107,7 +105,7 @@ def train_and_score(
     return net, result
 
 
-def hidden_errors(key: str, S: np.ndarray, frames: Landmarks) -> dict[str, float | str]:
+def hidden_errors(key: str, S: np.ndarray, frames: Landmarks) -> dict[str, Any]:
     """Mean normalised error under `key`, and that of the hidden points alone under `key`_hidden."""
     whole = float(metrics.normalized_error(S, frames.points3d).mean())
     if frames.visible.all():
@@ -146,7 +144,7 @@ def by_groups(keys: Sequence[str], columns: Sequence[str], rows: list[dict[str, 
     >>> print(by_groups(["data"], ["seen"], [{"data": "motion", "seen": "0.1"}, {"data": "motion", "seen": "0.3"}]))
     data motion, 2 seeds: seen 0.2 ± 0.14
     """
-    groups = {}
+    groups: dict[tuple[str, ...], list[dict[str, str]]] = {}
     for row in rows:
         groups.setdefault(tuple(f"{key} {row[key]}" for key in keys), []).append(row)
     return "\n".join(f"{', '.join(g)}, {len(r)} seeds: {mean_and_spread(r, columns)}" for g, r in groups.items())
