@@ -7,7 +7,7 @@ import torch
 from .. import metrics, shape_prior
 from ..cameras import image_turns, nearest_orthonormal, nearness, random_cameras
 from ..model import Config, DeepNRSfM
-from ..preprocessing import set_scale
+from ..normalizer import set_scale
 from ..threads import use_threads
 from ..training import PRIOR_FRAMES, SCHEDULES, make_optimizers, warmup_cosine
 from .lab import scoring
