@@ -10,17 +10,19 @@ nl.metrics.normalized_error(rec.shapes, data.points3d).mean()
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from . import data
+from .data import Landmarks, Reconstruction
+
 if TYPE_CHECKING:  # for editors and type checkers; at run time, see `__getattr__`
     from . import baselines, cameras, datasets, experiments, metrics, plotting, quality, sparse_coding
-    from .data import Landmarks, Reconstruction
     from .model import Config, DeepNRSfM
     from .reconstruction import reconstruct
-    from .training import fit
+    from .training import Schedule, fit
 
 __version__ = "0.1.0"
 
 __all__ = [
-    "Config", "DeepNRSfM", "Landmarks", "Reconstruction", "baselines", "cameras", "datasets",
+    "Config", "DeepNRSfM", "Landmarks", "Reconstruction", "Schedule", "baselines", "cameras", "datasets",
     "experiments", "fit", "metrics", "plotting", "quality", "reconstruct",
     "sparse_coding",
 ]  # fmt: skip
@@ -29,8 +31,7 @@ __all__ = [
 _HOMES = {
     "Config": "model",
     "DeepNRSfM": "model",
-    "Landmarks": "data",
-    "Reconstruction": "data",
+    "Schedule": "training",
     "fit": "training",
     "reconstruct": "reconstruction",
 }
@@ -50,6 +51,14 @@ def __getattr__(name: str) -> object:
     value = getattr(home, name) if name in _HOMES else home
     globals()[name] = value  # the next time, Python finds it itself
     return value
+
+
+def _network_from_arrays(config: dict, arrays: dict) -> object:
+    return import_module(f"{__name__}.model").DeepNRSfM.from_arrays(config, arrays)
+
+
+# `data` reads networks back without knowing how one is built.
+data.network_from_arrays = _network_from_arrays
 
 
 def __dir__() -> list[str]:

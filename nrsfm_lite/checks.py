@@ -14,22 +14,48 @@ def as_array(name: str, value: Any, dtype: type) -> np.ndarray:
 
     Whole numbers must be whole (0.9 is not 0), and a mask must hold truth values or 0 and 1. Raises ValueError.
     """
-    if hasattr(value, "detach"):
-        value = value.detach().cpu().numpy()
     try:
-        array = np.array(value, dtype)
+        if hasattr(value, "detach"):
+            value = value.detach().cpu()
+            value = (value.double() if value.is_floating_point() else value).numpy()  # NumPy has no bfloat16
+        if np.iscomplexobj(value):
+            raise ValueError  # NumPy would drop the imaginary part with a warning only
+        with np.errstate(invalid="ignore"):  # NaN as a whole number: refused in the next line
+            array = np.array(value, dtype)
         if dtype is not float and not np.array_equal(np.asarray(value, float), array):
             raise ValueError
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         kind = {float: "numbers", int: "whole numbers", bool: "truth values"}[dtype]
         raise ValueError(f"{name} cannot be read as an array of {kind}.") from None
     return array
+
+
+def as_edges(name: str, value: Any, n_points: int) -> np.ndarray:
+    """Pairs of points as an (E, 2) int array; None or nothing is no edge. Raises ValueError."""
+    edges = as_array(name, () if value is None else value, int)
+    if edges.size == 0:
+        return edges.reshape(0, 2)
+    if edges.ndim != 2 or edges.shape[1] != 2:
+        raise ValueError(f"{name} has shape {edges.shape}; expected (E, 2).")
+    if edges.min() < 0 or edges.max() >= n_points:
+        raise ValueError(f"{name} refers to a point outside 0 … {n_points - 1}.")
+    return edges
 
 
 def check_shape(name: str, array: Any, expected: tuple[int, ...]) -> None:
     """Raise ValueError unless an array has the expected shape."""
     if tuple(array.shape) != tuple(expected):
         raise ValueError(f"{name} has shape {tuple(array.shape)}; expected {tuple(expected)}.")
+
+
+def check_finite(name: str, array: np.ndarray) -> None:
+    """Raise ValueError if a value is NaN or infinite, naming the first frame (the first axis)."""
+    bad = ~np.isfinite(array)
+    if bad.any():
+        frame = int(np.argwhere(bad)[0, 0])
+        raise ValueError(
+            f"{name} has {int(bad.sum())} values that are not finite numbers (the first in frame {frame})."
+        )
 
 
 def check_visible_finite(name: str, points: np.ndarray, visible: np.ndarray) -> None:

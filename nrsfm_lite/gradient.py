@@ -5,15 +5,27 @@ network is a chain of matrix products, so its gradient is one too, and fits on a
 `model.DeepNRSfM` is the definition; the tests hold the two together.
 """
 
+from __future__ import annotations
+
 import torch
+from torch import Tensor
 
 from .cameras import polar, polar_gradient
+from .model import DeepNRSfM
 
 _relu_backward = torch.ops.aten.threshold_backward.grad_input
 
 
 @torch.no_grad()
-def backpropagate(net, image, visible=None, size=None, pull=0.0, X=None):
+def backpropagate(
+    net: DeepNRSfM,
+    image: Tensor,
+    weight: Tensor | None = None,
+    *,
+    size: Tensor | None = None,
+    pull: float = 0.0,
+    X: Tensor | None = None,
+) -> Tensor:
     """The training loss of a batch (paper, eq. 27); its gradient is left in the parameters' ``.grad``.
 
     ``mean_f ‖Ω (W_f − S_f M_f − 1 t_fᵀ)‖_F / size_f``, with the network's shape and camera of each frame and the
@@ -25,8 +37,8 @@ def backpropagate(net, image, visible=None, size=None, pull=0.0, X=None):
     net : DeepNRSfM
     image : (B, P, 2) tensor
         What the encoder takes.
-    visible : (B, P) tensor, optional
-        Bool, or weights from 0 to 1, of which Ω holds the square roots. Default: everything.
+    weight : (B, P) tensor, optional
+        Bool, or numbers from 0 to 1, of which Ω holds the square roots. Default: everything.
     size : (B,) tensor, optional
         Default: ‖X_f‖_F, as in the authors' code. Ones give the paper's own loss.
     pull : float
@@ -63,10 +75,10 @@ def backpropagate(net, image, visible=None, size=None, pull=0.0, X=None):
         decoded.append(_threshold(torch.addmm(ci, decoded[-1], Di.mT, beta=-1), ci, soft))  # (B, K_{i-1})
     S = torch.addmm(net.output_bias.view(-1), decoded[-1], D0.view(len(D0), -1)).view(B, P, 3)
     R = torch.baddbmm(X, S, M, beta=-1)
-    if visible is not None:
-        weight = visible.to(R.dtype)[..., None]
-        t = (R * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
-        root = weight.sqrt()
+    if weight is not None:
+        share = weight.to(R.dtype)[..., None]
+        t = (R * share).sum(1, keepdim=True) / share.sum(1, keepdim=True)
+        root = share.sqrt()
         R = R.sub_(t).mul_(root)
     elif net.config.translation:
         R -= R.mean(1, keepdim=True)
@@ -76,7 +88,7 @@ def backpropagate(net, image, visible=None, size=None, pull=0.0, X=None):
     # loss does not change with t, so t counts as a constant.
     minus = X.new_full((2 * rows * B,), -1.0)  # sums up columns, as a product
     g = R.mul_((1 / (B * size * missed.clamp(min=1e-12)))[:, None, None])
-    if visible is not None:
+    if weight is not None:
         g *= root
     gM = S.mT @ g
     g = (g @ M.mT).view(B, -1)

@@ -3,17 +3,23 @@
 Shapes in comments: B frames, P points, K_i atoms of dictionary i, N dictionaries.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from . import completion, preprocessing
+from . import normalizer, weights
 from .cameras import nearest_orthonormal
-from .shape_prior import KINDS, Gaussian
+from .checks import one_of, truth, whole
+from .normalizer import Normalizer
+from .shape_prior import Gaussian, Prior
 from .sparse_coding import mutual_coherence
 
 EPSILON = 0.05  # ε of the 4×2 model: every entry of the row of translations in D₁, up to its sign
@@ -53,6 +59,11 @@ class Config:
     ------
     ValueError
         If a value is outside its range.
+
+    Examples
+    --------
+    >>> nl.Config(n_points=31, n_dictionaries=3).widths
+    [125, 67, 10]
     """
 
     n_points: int
@@ -66,14 +77,11 @@ class Config:
     fill: str = "likely"
     translation: bool = False
 
-    def __post_init__(self):
-        for key in ("n_points", "n_dictionaries", "first_atoms", "last_atoms"):
-            object.__setattr__(self, key, int(getattr(self, key)))  # NumPy integers cannot be written as JSON
-        if self.n_points < 3:
-            raise ValueError(f"n_points is {self.n_points}; a shape needs at least 3 points.")
-        if self.n_dictionaries < 1:
-            raise ValueError(f"n_dictionaries is {self.n_dictionaries}; expected at least 1.")
-        if not self.first_atoms >= self.last_atoms >= 2:
+    def __post_init__(self) -> None:
+        for key, least in [("n_points", 3), ("n_dictionaries", 1), ("first_atoms", 2), ("last_atoms", 2)]:
+            # A NumPy integer becomes an int, which can be written as JSON.
+            object.__setattr__(self, key, whole(key, getattr(self, key), least))
+        if self.first_atoms < self.last_atoms:
             raise ValueError(
                 f"first_atoms={self.first_atoms}, last_atoms={self.last_atoms}; "
                 "expected first_atoms >= last_atoms >= 2."
@@ -84,33 +92,49 @@ class Config:
             ("projection", ("orthographic", "weak_perspective")),
             ("fill", ("likely", "zero", "scaled")),
         ]:
-            if getattr(self, key) not in options:
-                raise ValueError(f"{key}={getattr(self, key)!r}; expected one of {', '.join(options)}.")
+            one_of(key, getattr(self, key), options)
+        for key in ("output_bias", "translation"):
+            object.__setattr__(self, key, truth(key, getattr(self, key)))
 
     @property
-    def widths(self):
+    def widths(self) -> list[int]:
         """[K₁, …, K_N]."""
         return np.linspace(self.first_atoms, self.last_atoms, self.n_dictionaries).astype(int).tolist()
 
     @property
-    def block_rows(self):
+    def block_rows(self) -> int:
         """3, or 4 with translations: blocks are 3×2 or 4×2."""
         return 4 if self.translation else 3
 
 
 class DeepNRSfM(nn.Module):
-    """Deep NRSfM with 3×2 blocks: 2D landmarks in, 3D shapes and cameras out.
+    """Deep NRSfM with 3×2 blocks: 2D landmarks in, 3D shapes and cameras out (arXiv:1907.13123).
 
     ``DeepNRSfM(n_points=31)`` takes the defaults, ``DeepNRSfM(Config(...))`` any setting. The
     parameters carry the names of the paper: `D` (list of dictionaries), `encoder_threshold`,
-    `decoder_threshold`, `beta`, `gamma`, `output_bias`. What `fit` finds besides is kept in buffers: `scale`,
-    the unit of length, and `origin`, so that results come back in the user's units; `image_covariance`, to fill
-    in hidden points; and the shape prior (`prior`).
-    The weights start Glorot-uniform as in the authors' code, drawn from `generator`; thresholds and S̄
-    start at zero.
+    `decoder_threshold`, `beta`, `gamma`, `output_bias`. The weights start Glorot-uniform as in the authors' code,
+    drawn from `generator`; thresholds and S̄ start at zero.
+
+    What `fit` finds besides is kept beside the parameters: `normalizer`, the way between image units and the
+    network's, and `prior`, the shape prior, or None.
+
+    Examples
+    --------
+    >>> S, M, t = nl.DeepNRSfM(n_points=8)(np.random.default_rng(0).normal(size=(5, 8, 2)))
+    >>> S.shape, M.shape, t.shape
+    (torch.Size([5, 8, 3]), torch.Size([5, 3, 2]), torch.Size([5, 2]))
     """
 
-    def __init__(self, config=None, *, n_points=None, generator=None):
+    normalizer: Normalizer
+    prior: Prior | None
+
+    def __init__(
+        self,
+        config: Config | None = None,
+        *,
+        n_points: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
         super().__init__()
         if config is None:
             if n_points is None:
@@ -129,18 +153,19 @@ class DeepNRSfM(nn.Module):
         self.beta = nn.Parameter(torch.empty(*(entries * K[-1], K[-1]) if config.beta == "full" else (entries,)))
         self.gamma = nn.Parameter(torch.empty(K[-1]))
         self.output_bias = nn.Parameter(torch.zeros(P, 3), requires_grad=config.output_bias)
-        self.register_buffer("scale", torch.ones(()))
-        self.register_buffer("origin", torch.zeros(2))
-        self.register_buffer("image_covariance", torch.eye(P) - 1 / P)
-        n = 1 + KINDS
-        self.register_buffer("prior_mean", torch.zeros(n, P, 3))
-        self.register_buffer("prior_covariance", torch.zeros(n, 3 * P, 3 * P))
-        self.register_buffer("prior_noise", torch.zeros(n))  # zero: not in use
+        self.normalizer = Normalizer(
+            projection=config.projection,
+            fill=config.fill,
+            translation=config.translation,
+            scale=1.0,
+            origin=torch.zeros(2, dtype=torch.float64),
+            covariance=torch.eye(P, dtype=torch.float64) - 1 / P,
+        )
+        self.prior = None
         self._draw_weights(generator)
 
-    def _draw_weights(self, generator):
-
-        def glorot(parameter, fan_in, fan_out):
+    def _draw_weights(self, generator: torch.Generator | None) -> None:
+        def glorot(parameter: Tensor, fan_in: int, fan_out: int) -> None:
             limit = (6 / (fan_in + fan_out)) ** 0.5
             nn.init.uniform_(parameter, -limit, limit, generator=generator)
 
@@ -153,39 +178,36 @@ class DeepNRSfM(nn.Module):
         glorot(self.gamma, last, 1)
 
     @property
-    def coherence(self):
+    def coherence(self) -> float:
         """Mutual coherence of the last dictionary, a quality measure that needs no truth (chapter 10)."""
         D = self.D[-1]
         return mutual_coherence(D if D.ndim == 2 else D.flatten(1).T)
 
     @property
-    def prior(self):
-        """The shape prior that `fit` learned with the network, a tuple of `shape_prior.Gaussian`, or None."""
-        each = zip(self.prior_mean, self.prior_covariance, self.prior_noise, strict=True)
-        return tuple(Gaussian(m.double().cpu(), C.double().cpu(), s.item()) for m, C, s in each if s > 0) or None
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return self.gamma.device
 
-    @prior.setter
-    def prior(self, prior):
-        self.prior_noise.zero_()
-        for i, gaussian in enumerate(prior):
-            self.prior_mean[i], self.prior_covariance[i] = gaussian.mean, gaussian.covariance
-            self.prior_noise[i] = gaussian.noise
+    @property
+    def dtype(self) -> torch.dtype:
+        """The type of the parameters; images come in and go out in their own."""
+        return self.gamma.dtype
 
-    def encode(self, X):
+    def encode(self, image: Tensor) -> Tensor:
         """Block sparse code of images (B, P, 2) as `normalize` makes them: Psi_N (B, 2, 3, K_N); 4×2 (B, 2, 4, K_N).
 
         One step of block ISTA per layer. The columns of a block come before its rows here, so that
         every layer is one matrix product over the flattened batch (chapter 06).
         """
-        B, P, _ = X.shape
+        B, P, _ = image.shape
         n = 2 * self.config.block_rows * B
-        Z = X.mT.reshape(2 * B, P) @ self.first_dictionary()  # (2B, rows K₁)
+        Z = image.mT.reshape(2 * B, P) @ self.first_dictionary()  # (2B, rows K₁)
         Z = self._threshold(Z.view(n, -1), self.encoder_threshold[0])  # (n, K₁)
         for D, b in zip(list(self.D)[1:], list(self.encoder_threshold)[1:], strict=True):
             Z = self._threshold(Z @ D, b)  # (n, K_i)
         return Z.view(B, 2, self.config.block_rows, -1)
 
-    def first_dictionary(self):
+    def first_dictionary(self) -> Tensor:
         """D₁ as the first layer multiplies with it: (P, 3 K₁), or (P, 4 K₁) with the row of translations.
 
         In the 4×2 model every atom is centred, so that rows 1 to 3 do not see the translation of a complete
@@ -199,12 +221,12 @@ class DeepNRSfM(nn.Module):
             D1 = torch.cat([D1, (EPSILON * sign).to(D1).expand(len(D1), 1, -1)], 1)
         return D1.reshape(len(D1), -1)
 
-    def _threshold(self, x, b):
+    def _threshold(self, x: Tensor, b: Tensor) -> Tensor:
         """η(x; b), one threshold per atom."""
         above = torch.relu(x - b)
         return above if self.config.threshold == "relu" else above - torch.relu(-x - b)
 
-    def bottleneck(self, Psi):
+    def bottleneck(self, Psi: Tensor) -> tuple[Tensor, Tensor]:
         """Sparse code and camera of Psi_N (B, 2, rows, K): psi (B, K) and M (B, 3, 2), orthonormal."""
         B, _, rows, K = Psi.shape
         full = self.config.beta == "full"
@@ -215,118 +237,126 @@ class DeepNRSfM(nn.Module):
             psi = psi.abs()
         return psi, nearest_orthonormal((Psi @ self.gamma)[:, :, :3].mT)
 
-    def decode(self, psi):
+    def decode(self, psi: Tensor) -> Tensor:
         """Shape of a sparse code, in normalised units: (B, K_N) -> (B, P, 3)."""
         for D, b in zip(list(self.D)[:0:-1], list(self.decoder_threshold)[::-1], strict=True):
             psi = self._threshold(psi @ D.mT, b)  # (B, K_{i-1})
         S = psi @ self.D[0].flatten(1)  # (B, 3P)
         return S.view(-1, *self.output_bias.shape) + self.output_bias
 
-    def scaled(self, W, visible):
-        """Points in the network's unit: X (B, P, 2) as in `normalize`; the mean (B, 2) and the scale (B,) taken out."""
-        X, mean = preprocessing.center(W, visible)
-        if self.config.projection == "orthographic":
-            scale = self.scale.expand(X.shape[0])  # not len(X), which `torch.export` would fix
-        else:
-            scale = preprocessing.frame_scale(X, visible)
-        return X / scale[:, None, None], mean, scale
+    def lift(self, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Code, shape and camera of normalised images, in the network's units.
 
-    def normalize(self, W, visible):
-        """From image coordinates to the network's.
+        Parameters
+        ----------
+        image : (B, P, 2) tensor, as `normalize` makes it; cast to the parameters' type
 
         Returns
         -------
-        image : (B, P, 2)
-            What the encoder takes: hidden points filled in, centred but for a model of translations.
-        X : (B, P, 2)
-            Points centred over the visible ones, zero where hidden: what the loss and the prior compare with.
-        scale : (B,)
+        psi : (B, K_N); S : (B, P, 3), not centred; M : (B, 3, 2), orthonormal columns
         """
-        X, mean, scale = self.scaled(W, visible)
-        if not torch.compiler.is_exporting() and (visible == 1).all():
-            image = X  # the shortcut is the same, but an exported graph has no branches
-        elif self.config.fill == "likely":
-            image = completion.fill(self.image_covariance.double(), X, visible)
-        else:
-            weight = visible.to(X.dtype)
-            unit = weight.mean(1, keepdim=True) if self.config.fill == "scaled" else 1.0
-            image = X * (weight / unit)[..., None]
-        if self.config.translation:
-            moved = preprocessing.visible_mean(X - image, visible)  # back to where the visible points are
-            image = image + (moved + (mean - self.origin) / scale[:, None])[:, None]
-            if self.config.fill != "likely":
-                image = image * (visible > 0)[..., None]
-        return image, X, scale
+        psi, M = self.bottleneck(self.encode(image.to(self.dtype)))
+        return psi, self.decode(psi), M
 
-    def forward(self, W, visible=None):
+    def normalize(self, W: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`Normalizer.normalize` of image points as they are, (B, P, 2), with weights (B, P): image, X and unit."""
+        return self.normalizer.normalize(*normalizer.center(W, weight), weight)
+
+    def forward(self, W: Any, visible: Any = None) -> tuple[Tensor, Tensor, Tensor]:
         """Shapes, cameras and translations of image points.
 
         Parameters
         ----------
-        W : (B, P, 2) tensor in image coordinates
-        visible : (B, P) tensor, optional
+        W : (B, P, 2) tensor or array in image coordinates; hidden points may be NaN
+        visible : (B, P) tensor or array, optional
             Bool, or weights from 0 to 1.
 
         Returns
         -------
         S : (B, P, 3), centred over the points; M : (B, 3, 2); t : (B, 2)
-            In the units of W; ``S @ M + t[:, None]`` reprojects.
-        """
-        if visible is None:
-            visible = torch.ones(W.shape[:2], dtype=torch.bool, device=W.device)
-        image, _, scale = self.normalize(W, visible)
-        psi, M = self.bottleneck(self.encode(image))
-        S = self.decode(psi)
-        S = (S - S.mean(1, keepdim=True)) * scale[:, None, None]
-        t = preprocessing.visible_mean(W - S @ M, visible)  # the best t in closed form
-        return S, M, t
+            In the units and the type of W, where the network is; ``S @ M + t[:, None]`` reprojects.
 
-    def save(self, path):
-        """Write configuration and weights to one file that holds no code; returns its path."""
-        path = Path(path)
-        weights = {key: value.detach().cpu() for key, value in self.state_dict().items()}
-        torch.save({"config": asdict(self.config), "weights": weights}, path)
-        return path
+        Raises
+        ------
+        ValueError
+            For arrays of wrong shape, or visible points that are not finite.
+        """
+        W, weight = (W, visible) if torch.compiler.is_exporting() else self._parse(W, visible)
+        X, mean = normalizer.center(W.double(), weight)
+        image, _, unit = self.normalizer.normalize(X, mean, weight)
+        _, S, M = self.lift(image)
+        S, M = S.double(), M.double()
+        S = (S - S.mean(1, keepdim=True)) * unit[:, None, None]
+        t = mean + normalizer.weighted_mean(X - S @ M, weight)  # the best t in closed form
+        return S.to(W.dtype), M.to(W.dtype), t.to(W.dtype)
+
+    def _parse(self, W: Any, visible: Any) -> tuple[Tensor, Tensor]:
+        """W and the points' weights as tensors where the network is."""
+        W = torch.as_tensor(W, device=self.device)
+        W = W if W.is_floating_point() else W.double()
+        P = self.config.n_points
+        if W.ndim != 3 or tuple(W.shape[1:]) != (P, 2):
+            raise ValueError(f"W has shape {tuple(W.shape)}; expected (B, {P}, 2), as the network has {P} points.")
+        if visible is None:
+            visible = torch.ones(W.shape[:2], dtype=torch.bool)
+        weight = torch.as_tensor(visible, device=self.device)
+        if weight.shape != W.shape[:2]:
+            raise ValueError(f"visible has shape {tuple(weight.shape)}; expected {tuple(W.shape[:2])}.")
+        if not torch.isfinite(W).all(2)[weight > 0].all():
+            raise ValueError("W has visible points that are NaN or infinite; mark missing points as False in visible.")
+        return W, weight
+
+    def save(self, path: str | Path) -> Path:
+        """Write configuration, weights, normaliser and prior to one file that holds no code; returns its path."""
+        return weights.save(path, *self.to_arrays())
 
     @classmethod
-    def load(cls, path):
+    def load(cls, path: str | Path) -> DeepNRSfM:
         """The network that `save` wrote, on the CPU and in evaluation mode.
 
         Raises FileNotFoundError if there is no such file, ValueError if it is not a saved network.
         """
-        path = Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file.")
         try:
-            saved = torch.load(path, weights_only=True, map_location="cpu")
-            return cls.from_arrays(saved["config"], saved["weights"])
-        except Exception as error:  # torch raises many kinds for a broken file
-            raise ValueError(f"{path}: not a saved network, or a broken one ({type(error).__name__}).") from None
+            return cls.from_arrays(*weights.load(path))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
 
-    def to_onnx(self, path):
+    def to_onnx(self, path: str | Path) -> Path:
         """Write the forward pass as ONNX, for any number of frames: W and visible in; S, M and t out.
 
         Needs the packages onnx and onnxscript (``pip install nrsfm-lite[onnx]``). Returns the path.
         """
-        W = torch.zeros(2, self.config.n_points, 2, dtype=self.scale.dtype, device=self.scale.device)
+        W = torch.zeros(2, self.config.n_points, 2, dtype=self.dtype, device=self.device)
         W[:, 0, 0], W[:, 1, 1] = 1, 1  # any two frames that are not a point
-        visible = torch.ones(W.shape[:2], dtype=torch.bool, device=W.device)
-        frames = {0: torch.export.Dim("frames", min=1)}
-        program = torch.export.export(self, (W, visible), dynamic_shapes=(frames, frames))
-        names = {"input_names": ["W", "visible"], "output_names": ["S", "M", "t"]}
-        torch.onnx.export(program, dynamo=True, verbose=False, **names).save(str(path))
-        return Path(path)
+        return weights.to_onnx(self, W, path)
 
-    def to_arrays(self):
-        """(config, weights) as a dict and a dict of NumPy arrays: all that `from_arrays` needs."""
-        return asdict(self.config), {k: v.detach().cpu().numpy() for k, v in self.state_dict().items()}
+    def to_arrays(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+        """(config, arrays) as a dict and a dict of NumPy arrays: all that `from_arrays` needs."""
+        arrays = {key: value.detach().cpu().numpy() for key, value in self.state_dict().items()}
+        for key in ("scale", "origin", "covariance"):
+            arrays[f"normalizer/{key}"] = np.asarray(getattr(self.normalizer, key))
+        for i, gaussian in enumerate(self.prior or ()):  # only what is in use
+            for key in ("mean", "covariance", "noise"):
+                arrays[f"prior/{i}/{key}"] = np.asarray(getattr(gaussian, key))
+        return asdict(self.config), arrays
 
     @classmethod
-    def from_arrays(cls, config, weights):
-        """The network that `to_arrays` took apart."""
-        weights = {k: torch.as_tensor(v) for k, v in weights.items()}
-        net = cls(Config(**config), generator=torch.Generator()).to(weights["scale"].dtype)
-        # Files of earlier versions lack these.
-        older = {k: v for k, v in net.state_dict().items() if k.startswith(("prior_", "origin", "image_"))}
-        net.load_state_dict(older | weights)
+    def from_arrays(cls, config: Mapping[str, Any], arrays: Mapping[str, Any]) -> DeepNRSfM:
+        """The network that `to_arrays` took apart, in evaluation mode.
+
+        Raises ValueError if something is missing or does not fit.
+        """
+        try:
+            net = cls(Config(**config), generator=torch.Generator())
+            tensors = {key: torch.as_tensor(value) for key, value in arrays.items()}
+            own = {key: value for key, value in tensors.items() if "/" not in key}
+            net.to(own["gamma"].dtype).load_state_dict(own)
+            found = {key: tensors[f"normalizer/{key}"] for key in ("scale", "origin", "covariance")}
+            settings = {key: getattr(net.config, key) for key in ("projection", "fill", "translation")}
+            net.normalizer = Normalizer(**settings, **found | {"scale": float(found["scale"])})
+            n = len({key.split("/")[1] for key in tensors if key.startswith("prior/")})
+            parts = [{key: tensors[f"prior/{i}/{key}"] for key in ("mean", "covariance", "noise")} for i in range(n)]
+            net.prior = tuple(Gaussian(p["mean"], p["covariance"], float(p["noise"])) for p in parts) or None
+        except (KeyError, TypeError, RuntimeError, ValueError):
+            raise ValueError("the network in it is incomplete or of another version.") from None
         return net.eval()

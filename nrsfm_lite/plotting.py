@@ -1,13 +1,19 @@
 """Pictures of shapes: matplotlib for the page, plotly to turn them. One look for the whole book."""
 
+from __future__ import annotations
+
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import plotly.graph_objects as go
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from .data import Landmarks, Reconstruction, as_points
+from . import checks, images
+from .data import Landmarks, Reconstruction
 from .metrics import align
 
 # Readable on white and on black, and for readers who do not tell red from green.
@@ -16,8 +22,11 @@ INK = "#767676"  # text and axes
 _PREDICTED_NAME, _TRUE_NAME = "reconstruction", "truth"
 
 
-def use_style():
-    """Matplotlib's settings of the book: transparent, without clutter, readable on white and on black."""
+def use_style() -> None:
+    """Matplotlib's settings of the book: transparent, without clutter, readable on white and on black.
+
+    >>> nl.plotting.use_style()
+    """
     plt.rcParams.update(
         {
             **{f"{part}.facecolor": "none" for part in ("figure", "axes", "savefig", "legend")},
@@ -32,7 +41,16 @@ def use_style():
     )
 
 
-def show3d(shapes, truth=None, edges=None, *, max_frames=60, up=None, title=None, height=520):
+def show3d(
+    shapes: Any,
+    truth: Any = None,
+    edges: Any = None,
+    *,
+    max_frames: int = 60,
+    up: Any = None,
+    title: str | None = None,
+    height: int = 520,
+) -> go.Figure:
     """Shapes to turn, with a frame slider and a play button; standing upright.
 
     Parameters
@@ -60,18 +78,32 @@ def show3d(shapes, truth=None, edges=None, *, max_frames=60, up=None, title=None
     Raises
     ------
     ValueError
-        If there are no 3D points, or if `shapes` and `truth` differ in shape.
+        If there are no 3D points or no frames, if a value is not finite, if `shapes` and `truth` differ in
+        shape, or if an edge refers to a point that is not there.
+
+    Examples
+    --------
+    >>> figure = nl.plotting.show3d(nl.datasets.make_motion(50), max_frames=10)
+    >>> len(figure.frames)
+    10
     """
+    max_frames, height = checks.whole("max_frames", max_frames, 1), checks.whole("height", height, 1)
     points, own_edges = _points(shapes, "shapes")
     if truth is not None:
         true_points, true_edges = _points(truth, "truth")
+        if true_points.shape != points.shape:
+            raise ValueError(f"truth has shape {true_points.shape}; expected that of shapes, {points.shape}.")
         points, true_points = align(points, true_points)
         own_edges = own_edges if len(own_edges) else true_edges
     else:
         true_points = None
         points = points - points.mean(1, keepdims=True)
-    edges = own_edges if edges is None else np.asarray(edges, int).reshape(-1, 2)
-    if up is None and true_points is None and isinstance(shapes, Reconstruction):
+    edges = own_edges if edges is None else checks.as_edges("edges", edges, points.shape[1])
+    if up is not None:
+        up = checks.as_array("up", up, float)
+        if up.shape != (3,) or not 0 < np.linalg.norm(up) < np.inf:
+            raise ValueError(f"up={up}; expected a direction, three numbers that are not all zero.")
+    elif true_points is None and isinstance(shapes, Reconstruction):
         points = _in_one_pose(points)
         up = _guess_up(points, shapes)
     turn = _upright((0, 1, 0) if up is None else up)
@@ -88,28 +120,42 @@ def show3d(shapes, truth=None, edges=None, *, max_frames=60, up=None, title=None
     return figure
 
 
-def show2d(W, edges=None, frames=None, *, visible=None, columns=6):
+def show2d(W: Any, edges: Any = None, *, frames: Any = None, visible: Any = None, columns: int = 6) -> Figure:
     """What the cameras saw: a row of frames in matplotlib.
 
     Parameters
     ----------
     W : Landmarks with points2d, or (F, P, 2) array
     edges : (E, 2) int, optional
+        Default: those of the Landmarks.
     frames : sequence of int, optional
         Default: `columns` frames, evenly spread.
     visible : (F, P) bool, optional
+        Default: that of the Landmarks, else everything. A hidden point, and its edges, are not drawn.
+    columns : int
 
     Returns
     -------
     matplotlib Figure
+
+    Raises
+    ------
+    ValueError
+        As `images.parse`; also if a frame or an edge is not there.
+
+    Examples
+    --------
+    >>> views = nl.datasets.make_views(nl.datasets.make_motion(50))
+    >>> len(nl.plotting.show2d(views, columns=3).axes)
+    3
     """
-    W, visible, _, own_edges = as_points(W, visible)
-    W = np.where(visible[..., None], W, np.nan)
-    edges = np.asarray(own_edges if edges is None else edges, int).reshape(-1, 2)
-    frames = _spread(len(W), columns) if frames is None else np.asarray(frames)
+    seen = images.parse(W, visible)
+    edges = seen.edges if edges is None else checks.as_edges("edges", edges, seen.n_points)
+    frames = _chosen(frames, len(seen), columns)
+    W = np.where(seen.visible[..., None], seen.points, np.nan)
     figure, axes = plt.subplots(1, len(frames), figsize=(1.5 * len(frames), 1.9), layout="constrained", squeeze=False)
     middle = np.nanmean(W[frames], axis=1)
-    reach = 1.1 * np.nanmax(np.abs(W[frames] - middle[:, None]))
+    reach = 1.1 * np.nanmax(np.abs(W[frames] - middle[:, None])) or 1.0  # all points at one place
     for axis, f, (x, y) in zip(axes[0], frames, middle, strict=True):
         draw2d(axis, W[f], edges, SEEN)
         axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach))
@@ -118,23 +164,48 @@ def show2d(W, edges=None, frames=None, *, visible=None, columns=6):
     return figure
 
 
-def compare(rec, truth, frames=None, *, columns=5):
+def compare(rec: Reconstruction, truth: Landmarks, frames: Any = None, *, columns: int = 5) -> Figure:
     """A page-ready picture of a reconstruction: what the camera saw, and the body from two other sides.
 
     Parameters
     ----------
     rec : Reconstruction
-    truth : Landmarks with points2d and points3d, y up
+    truth : Landmarks with points2d and points3d of the same frames, y up
+        Points that are hidden are not drawn in the first row.
     frames : sequence of int, optional
         Default: `columns` frames, evenly spread.
+    columns : int
 
     Returns
     -------
     matplotlib Figure of three rows, one column per frame; each prediction is moved onto its truth.
+
+    Raises
+    ------
+    ValueError
+        If `truth` lacks points2d or points3d, if its frames or points are not those of `rec`, or if a frame is not
+        there.
+
+    Examples
+    --------
+    >>> views = nl.datasets.make_views(nl.datasets.make_motion(50))
+    >>> rec = nl.baselines.tomasi_kanade(views)
+    >>> len(nl.plotting.compare(rec, views, columns=2).axes)
+    6
     """
-    frames = _spread(len(rec), columns) if frames is None else np.asarray(frames)
+    if not isinstance(rec, Reconstruction):
+        raise ValueError(f"rec is a {type(rec).__name__}; expected a Reconstruction.")
+    if not isinstance(truth, Landmarks) or truth.points2d is None or truth.points3d is None:
+        raise ValueError("truth must be Landmarks with points2d and points3d; datasets.make_views makes them.")
+    if truth.points3d.shape != rec.shapes.shape:
+        raise ValueError(
+            f"truth has points3d of shape {truth.points3d.shape}; expected that of rec, {rec.shapes.shape}."
+        )
+    frames = _chosen(frames, len(rec), columns)
     predicted, true = align(rec.shapes[frames], truth.points3d[frames])
-    seen = truth.points2d[frames] - np.nanmean(truth.points2d[frames], axis=1, keepdims=True)
+    shown = images.parse(truth)
+    seen = np.where(shown.visible[..., None], shown.points, np.nan)[frames]
+    seen = seen - np.nanmean(seen, axis=1, keepdims=True)
     reach = 1.02 * max(np.abs(true).max(), np.nanmax(np.abs(seen)))
     rows = {
         "seen by the camera": [(seen, SEEN)],
@@ -152,16 +223,31 @@ def compare(rec, truth, frames=None, *, columns=5):
     return figure
 
 
-def draw2d(axis, points, edges, colour, label=None):
-    """One stick figure, points (P, 2), on a matplotlib axis; NaN points are left out."""
-    axis.plot(*_segments(points, edges).T, color=colour, lw=1.5, label=label)
+def draw2d(axis: Axes, points: Any, edges: Any, colour: str, *, label: str | None = None) -> None:
+    """One stick figure, points (P, 2), on a matplotlib axis; NaN points, and their edges, are left out.
+
+    Raises ValueError if the points have another shape, or if an edge refers to a point that is not there.
+
+    >>> import matplotlib.pyplot as plt
+    >>> nl.plotting.draw2d(plt.figure().subplots(), np.eye(3, 2), [(0, 1), (1, 2)], nl.plotting.TRUE)
+    """
+    points = checks.as_array("points", points, float)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"points has shape {points.shape}; expected (P, 2).")
+    axis.plot(*_segments(points, checks.as_edges("edges", edges, len(points))).T, color=colour, lw=1.5, label=label)
     axis.plot(*points.T, ".", color=colour, ms=4)
     axis.set(aspect="equal", xticks=[], yticks=[])
     axis.spines[:].set_visible(False)
 
 
-def write_html(figure, path):
-    """A plotly figure as one self-contained page that opens offline."""
+def write_html(figure: go.Figure, path: str | Path) -> Path:
+    """A plotly figure as one self-contained page that opens offline; returns its path.
+
+    >>> import tempfile
+    >>> figure = nl.plotting.show3d(nl.datasets.make_motion(50), max_frames=1)
+    >>> nl.plotting.write_html(figure, tempfile.mkdtemp() + "/scene.html").name
+    'scene.html'
+    """
     path = Path(path)
     title = figure.layout.title.text or path.stem
     page = figure.to_html(include_plotlyjs=True, full_html=True, config={"displaylogo": False, "responsive": True})
@@ -172,6 +258,7 @@ def write_html(figure, path):
         "<script>addEventListener('unhandledrejection',e=>{if(e.reason===undefined)e.preventDefault()})</script>"
     )
     path.write_text(page.replace("<head>", head, 1), encoding="utf-8")
+    return path
 
 
 def _spread(n_frames, at_most):
@@ -179,18 +266,30 @@ def _spread(n_frames, at_most):
     return np.linspace(0, n_frames - 1, min(n_frames, at_most)).round().astype(int)
 
 
+def _chosen(frames, n_frames, columns):
+    """The frames to draw: those asked for, else `columns` of them, evenly spread."""
+    if frames is None:
+        return _spread(n_frames, checks.whole("columns", columns, 1))
+    frames = checks.as_array("frames", frames, int)
+    if frames.ndim != 1 or not len(frames) or frames.min() < 0 or frames.max() >= n_frames:
+        raise ValueError(f"frames={frames.tolist()}; expected a sequence of numbers from 0 to {n_frames - 1}.")
+    return frames
+
+
 def _points(source, argument):
     """3D points and edges of whatever was given."""
     if isinstance(source, Reconstruction):
-        return source.shapes, source.edges
-    if isinstance(source, Landmarks):
+        points, edges = source.shapes, source.edges
+    elif isinstance(source, Landmarks):
         if source.points3d is None:
             raise ValueError(f"{argument} has no points3d.")
-        return source.points3d, source.edges
-    points = np.asarray(source.detach().cpu() if hasattr(source, "detach") else source, float)
-    if points.ndim != 3 or points.shape[2] != 3:
-        raise ValueError(f"{argument} has shape {points.shape}; expected (F, P, 3).")
-    return points, np.zeros((0, 2), int)
+        points, edges = source.points3d, source.edges
+    else:
+        points, edges = checks.as_array(argument, source, float), np.zeros((0, 2), int)
+    if points.ndim != 3 or points.shape[2] != 3 or not len(points):
+        raise ValueError(f"{argument} has shape {points.shape}; expected (F, P, 3) with at least one frame.")
+    checks.check_finite(argument, points)
+    return points, edges
 
 
 def _in_one_pose(points):

@@ -1,14 +1,25 @@
 """The front door: 2D landmarks in, 3D shapes and cameras out."""
 
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import torch
+from torch import Tensor
+from tqdm import tqdm
 
-from . import preprocessing, shape_prior
+from . import normalizer, shape_prior
 from .cameras import nearest_orthonormal
-from .data import Landmarks, Reconstruction, as_points, as_weights
-from .model import Config
+from .checks import one_of, truth, whole
+from .data import Reconstruction
+from .images import Images, read
+from .model import Config, DeepNRSfM
+from .shape_prior import Prior
 from .threads import use_threads
-from .training import fit, learn_prior
+from .training import SCHEDULES, check_training, learn_prior, read_to_train, train
 
 _CHUNK = 4096  # frames per pass: memory stays flat in the number of frames
 _REFINE_STEPS = 150
@@ -16,20 +27,21 @@ _REFINE_RATE = 0.07
 
 
 def reconstruct(
-    W,
-    visible=None,
-    model=None,
-    steps=None,
-    translation=False,
-    projection="orthographic",
-    refine=True,
-    adapt=False,
-    confidence=None,
-    seed=0,
-    device=None,
-    progress=True,
-    checkpoint=None,
-):
+    W: Any,
+    visible: Any = None,
+    model: DeepNRSfM | None = None,
+    *,
+    steps: int | None = None,
+    translation: bool | None = None,
+    projection: str | None = None,
+    refine: bool | str = True,
+    adapt: bool = False,
+    confidence: Any = None,
+    seed: int = 0,
+    device: str | torch.device | None = None,
+    progress: bool = True,
+    checkpoint: str | Path | None = None,
+) -> Reconstruction:
     """3D shapes and cameras of 2D landmarks, without any 3D supervision.
 
     Trains a network on the frames (or takes a trained one), infers every frame's shape and camera, and
@@ -42,14 +54,16 @@ def reconstruct(
     visible : (F, P) bool, optional
         False where a point is missing. Default: that of the Landmarks, else everything.
     model : DeepNRSfM, optional
-        A trained network, for instance ``rec.model``: no training takes place.
+        A trained network, for instance ``rec.model``: no training takes place, and what only concerns training
+        (steps, checkpoint, device) is refused.
     steps : int, optional
         Training steps. Default: those of the default schedule.
-    translation : bool
+    translation : bool, optional
         Train a 4×2 model, which takes the images as they are, uncentred, and finds their translation (chapter
-        13). A given model is what it is.
-    projection : "orthographic" or "weak_perspective"
-        One scale for all frames, or one per frame that goes into the shape.
+        13). Default: False, or what the given model is.
+    projection : "orthographic" or "weak_perspective", optional
+        One scale for all frames, or one per frame that goes into the shape. Default: orthographic, or what the
+        given model is.
     refine : True, "code" or False
         True: the most probable shape of each frame under the model's shape prior, with the camera fitted
         to it from the network's guess. "code": code and camera fitted to the frame's points by gradient
@@ -59,8 +73,8 @@ def reconstruct(
         some hundred frames or more. Without it, each frame is reconstructed on its own. A model without
         a prior always learns it here.
     confidence : (F, P), optional
-        From 0 to 1: how far to trust each visible point. A weight in the network's first layer and its loss; in
-        the refinement, a point's noise is divided by it. Default: that of the Landmarks, else 1.
+        From 0 to 1: how far to trust each visible point; 0 hides it. A weight in the network's first layer and its
+        loss; in the refinement, a point's noise is divided by it. Default: that of the Landmarks, else 1.
     seed, device, progress, checkpoint
         As in `fit`; they concern the training. Inference runs where the model is.
 
@@ -71,85 +85,125 @@ def reconstruct(
     Raises
     ------
     ValueError
-        As `fit`; also if `model` was trained for another number of points or another projection.
+        As `fit`; also if `model` was trained for another number of points or another projection, and for arguments
+        that contradict each other or cannot act.
+
+    Examples
+    --------
+    >>> views = nl.datasets.make_views(nl.datasets.make_motion(60))
+    >>> nl.reconstruct(views, steps=3, progress=False).shapes.shape
+    (60, 31, 3)
     """
-    if refine not in (True, False, "code"):
-        raise ValueError(f"refine={refine!r}; expected True, False or 'code'.")
-    weight = torch.as_tensor(as_weights(W, visible, confidence))
-    W, visible, names, edges = as_points(W, visible)
-    W = torch.as_tensor(W)
+    one_of("refine", refine, (True, False, "code"))
+    if truth("adapt", adapt) and refine is not True:
+        raise ValueError(
+            f"adapt=True with refine={refine!r}; the prior that it learns is of use with refine=True only."
+        )
+    seed = whole("seed", seed, 0)
+    trained = model is None
     if model is None:
-        config = Config(n_points=W.shape[1], projection=projection, translation=translation)
-        model = fit(
-            Landmarks(W, visible, weight, names=names, edges=edges), config=config, steps=steps, seed=seed,
-            device=device, progress=progress, checkpoint=checkpoint,
+        plan = SCHEDULES["default"] if steps is None else replace(SCHEDULES["default"], steps=steps)
+        device = check_training(seed, device, checkpoint)
+        images = read_to_train(W, visible, confidence)
+        config = Config(images.n_points, projection=projection or "orthographic", translation=translation or False)
+        model = train(
+            images, config, plan, seed=seed, device=device, progress=progress, checkpoint=checkpoint
         )  # fmt: skip
-    elif model.config.n_points != W.shape[1]:
-        raise ValueError(f"model was trained for {model.config.n_points} points, but W has {W.shape[1]}.")
-    elif model.config.projection != projection:
-        raise ValueError(f"model was trained for projection={model.config.projection!r}, not {projection!r}.")
     else:
-        preprocessing.check_extent(W, weight)  # `fit` has checked its own frames
+        _check_given(model, steps=steps, checkpoint=checkpoint, device=device)
+        _check_same(model, projection=projection, translation=translation)
+        images = read(W, visible, confidence, method="reconstruct", every_point=False)
+        if model.config.n_points != images.n_points:
+            raise ValueError(f"model was trained for {model.config.n_points} points, but W has {images.n_points}.")
     with use_threads(1):  # as in `fit`: never slow on a busy machine, and the same result everywhere
-        if refine and refine != "code":
-            refine = None if adapt else model.prior
-            if refine is None:
-                device = model.scale.device
-                image, X, _ = model.normalize(W.to(device), weight.to(device))
-                refine = learn_prior(model, image, X.cpu(), weight, torch.Generator().manual_seed(seed))
-        F, P, _ = W.shape
-        S, M, t = np.empty((F, P, 3)), np.empty((F, 3, 2)), np.empty((F, 2))
+        how: Prior | str | None = "code" if refine == "code" else None
+        if refine is True:
+            how = None if adapt else model.prior
+            if how is None and not (trained and not adapt):  # `train` has said why there is none
+                how = _learn_prior(model, images, seed)
+        S, M, t = _infer(model, images, how, progress)
+    return images.reconstruction(S, M, t, scale=1.0, method="deep_nrsfm", coherence=model.coherence, model=model)
+
+
+def _check_given(model: DeepNRSfM, **training: Any) -> None:
+    """Refuse what only concerns a training, where there is none."""
+    if not isinstance(model, DeepNRSfM):
+        raise ValueError(f"model is a {type(model).__name__}; expected a DeepNRSfM, such as rec.model.")
+    for name, value in training.items():
+        if value is not None:
+            raise ValueError(f"{name}={value!r} with a trained model: it concerns the training, and there is none.")
+
+
+def _check_same(model: DeepNRSfM, **settings: Any) -> None:
+    """Refuse settings that a given model does not have."""
+    for name, value in settings.items():
+        own = getattr(model.config, name)
+        if value is not None and value != own:
+            raise ValueError(f"model was trained for {name}={own!r}, not {value!r}.")
+
+
+def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> Prior:
+    """The shape prior of these frames."""
+    X, mean, weight = _part(images, slice(None), model.device)
+    image, X, _ = model.normalizer.normalize(X, mean, weight)
+    return learn_prior(model, image, X.cpu(), weight.cpu(), torch.Generator().manual_seed(seed))
+
+
+def _part(images: Images, part: slice, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Centred points, means and weights of some frames, as tensors on a device."""
+    X, mean, weight = (torch.as_tensor(a[part]).to(device) for a in (images.centred, images.mean, images.weight))
+    return X, mean, weight
+
+
+def _infer(
+    model: DeepNRSfM, images: Images, how: Prior | str | None, progress: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shapes, cameras and translations of all frames, in the user's units, chunk by chunk."""
+    F, P = images.weight.shape
+    S, M, t = np.empty((F, P, 3)), np.empty((F, 3, 2)), np.empty((F, 2))
+    with tqdm(total=F, desc="refining", unit="frame", disable=not (progress and how), mininterval=0.5) as bar:
         for first in range(0, F, _CHUNK):
             part = slice(first, first + _CHUNK)
-            S[part], M[part], t[part] = infer(model, W[part], weight[part], refine)
-    return Reconstruction(
-        shapes=S,
-        cameras=M,
-        translations=t,
-        visible=visible,
-        names=names,
-        edges=edges,
-        coherence=model.coherence,
-        method="deep_nrsfm",
-        model=model,
-    )
+            S[part], M[part], t[part] = infer(model, *_part(images, part, model.device), how)
+            bar.update(len(S[part]))
+    return S, M, t
 
 
-def infer(model, W, visible, refine=False):
+def infer(
+    model: DeepNRSfM, W: Tensor, mean: Tensor, weight: Tensor, how: Prior | str | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
     """Shapes, cameras and translations of some frames by a trained network, in double precision at the end.
 
     Parameters
     ----------
     model : DeepNRSfM
-    W, visible : tensors (B, P, 2) and (B, P)
-        `visible` is bool or holds weights from 0 to 1.
-    refine : shape prior (as `shape_prior.learn` returns it), "code" or False
+    W, mean, weight : double tensors (B, P, 2), (B, 2) and (B, P) where the model is
+        Centred image points, what was subtracted, and how much each point counts.
+    how : shape prior (as `shape_prior.learn` returns it), "code" or None
         How to go on from the network's guess.
 
     Returns
     -------
-    S (B, P, 3) centred, M (B, 3, 2), t (B, 2): tensors in the units of W.
+    S (B, P, 3) centred, M (B, 3, 2), t (B, 2) beyond the mean: tensors on the CPU in the units of W.
     """
-    device = model.scale.device
-    image, X, scale = model.normalize(W.to(device), visible.to(device))
+    image, X, unit = model.normalizer.normalize(W, mean, weight)
     with torch.no_grad():
-        psi, M = model.bottleneck(model.encode(image.to(model.scale.dtype)))
-    if isinstance(refine, tuple):
-        S, M = shape_prior.apply(refine, X.cpu(), visible, M.cpu())
-    else:
-        if refine == "code":
-            psi, M = _refine_code(model, X.to(model.scale.dtype), visible.to(device), psi, M)
+        psi, S, M = model.lift(image)
+    if how is not None and not isinstance(how, str):
+        S, M = shape_prior.apply(how, X.cpu(), weight.cpu(), M.cpu())
+    elif how == "code":
+        psi, M = _refine_code(model, X.to(model.dtype), weight, psi, M)
         with torch.no_grad():
-            S = model.decode(psi).double().cpu()
+            S = model.decode(psi)
     # A float32 camera is orthonormal to 1e-7; once more in double precision costs nothing.
-    M = nearest_orthonormal(M.detach().double().cpu())
-    S = (S - S.mean(1, keepdim=True)) * scale[:, None, None].double().cpu()
-    return S, M, preprocessing.visible_mean(W - S @ M, visible)
+    S, M = S.double().cpu(), nearest_orthonormal(M.detach().double().cpu())
+    S = (S - S.mean(1, keepdim=True)) * unit[:, None, None].cpu()
+    return S, M, normalizer.weighted_mean(W.cpu() - S @ M, weight.cpu())
 
 
-def _refine_code(model, X, visible, psi, M):
+def _refine_code(model: DeepNRSfM, X: Tensor, weight: Tensor, psi: Tensor, M: Tensor) -> tuple[Tensor, Tensor]:
     """Code (B, K) and camera (B, 3, 2) after Adam on each frame's reprojection error, translations at their best."""
-    weight = visible.to(X.dtype)
+    weight = weight.to(X.dtype)
     unit = psi.abs().mean(1, keepdim=True).clamp(min=1e-6)  # codes live on the network's own scale
     code, camera = (psi / unit).clone().requires_grad_(), M.clone().requires_grad_()
     optimizer = torch.optim.Adam([code, camera], _REFINE_RATE)
@@ -157,9 +211,9 @@ def _refine_code(model, X, visible, psi, M):
         for group in optimizer.param_groups:
             group["lr"] = _REFINE_RATE * (1 - step / _REFINE_STEPS)
         with torch.enable_grad():
-            residual, _ = preprocessing.center(X - model.decode(code * unit) @ nearest_orthonormal(camera), weight)
+            rest, _ = normalizer.center(X - model.decode(code * unit) @ nearest_orthonormal(camera), weight)
             # Each frame on its own: the sum's gradient for one frame does not see the others.
-            objective = (residual.square().sum(2) * weight).sum()
+            objective = (rest.square().sum(2) * weight).sum()
             code.grad, camera.grad = torch.autograd.grad(objective, [code, camera])
         optimizer.step()
     with torch.no_grad():

@@ -5,10 +5,18 @@ Block codes: the first dictionary D (K, P, 3), data W (B, P, 2), codes Z (B, K, 
 takes and returns tensors, any number of problems at once, and autograd passes through.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import torch
+from torch import Tensor
+
+from . import checks
 
 
-def soft_threshold(x, tau, *, nonnegative=False):
+def soft_threshold(x: Tensor, tau: float | Tensor, *, nonnegative: bool = False) -> Tensor:
     """Move every entry towards zero by tau, and to zero if it is closer: the proximal map of τ‖·‖₁.
 
     Parameters
@@ -26,14 +34,21 @@ def soft_threshold(x, tau, *, nonnegative=False):
     ------
     ValueError
         If tau is negative somewhere.
+
+    Examples
+    --------
+    >>> nl.sparse_coding.soft_threshold(torch.tensor([-3.0, 0.5, 2.0]), 1.0)
+    tensor([-2.,  0.,  1.])
     """
     tau = _threshold(tau, x)
     up = torch.relu(x - tau)
     return up if nonnegative else up - torch.relu(-x - tau)
 
 
-def block_soft_threshold(Z, tau, *, exact=True):
+def block_soft_threshold(Z: Tensor, tau: float | Tensor, *, exact: bool = True) -> Tensor:
     """Threshold whole blocks: the proximal map of Σ τ_k ‖Z_k‖_F, or the paper's approximation of it.
+
+    The proximal map is that of the group lasso (Yuan & Lin, 2006, doi:10.1111/j.1467-9868.2005.00532.x).
 
     Parameters
     ----------
@@ -51,8 +66,16 @@ def block_soft_threshold(Z, tau, *, exact=True):
     Raises
     ------
     ValueError
-        If tau is negative somewhere.
+        If tau is negative somewhere, or Z has no blocks.
+
+    Examples
+    --------
+    >>> Z = torch.tensor([[[3.0, 4.0]], [[0.3, 0.4]]])  # blocks of lengths 5 and 0.5
+    >>> nl.sparse_coding.block_soft_threshold(Z, 1.0).norm(dim=(1, 2)).round(decimals=3)
+    tensor([4., 0.])
     """
+    if Z.ndim < 3:
+        raise ValueError(f"Z has shape {tuple(Z.shape)}; expected (..., K, a, b).")
     tau = _threshold(tau, Z)[..., None, None]
     if not exact:
         return soft_threshold(Z, tau)
@@ -62,17 +85,33 @@ def block_soft_threshold(Z, tau, *, exact=True):
     return torch.where(nonzero, Z * torch.relu(1 - tau / length), torch.zeros_like(Z))
 
 
-def lipschitz(D):
+def lipschitz(D: Tensor) -> Tensor:
     """Largest eigenvalue of DᵀD, the Lipschitz constant of the gradient of ½‖x − Dz‖².
 
     D is (n, K), or a first dictionary (K, P, 3) whose atoms stand side by side in D♯ (P, 3K).
     Steps of up to 1 / lipschitz(D) never overshoot (chapter 03). Returns a scalar tensor.
+
+    >>> nl.sparse_coding.lipschitz(2 * torch.eye(3)).round()
+    tensor(4.)
     """
+    if D.ndim not in (2, 3):
+        raise ValueError(f"D has shape {tuple(D.shape)}; expected (n, K) or (K, P, 3).")
     return torch.linalg.matrix_norm(_sharp(D), ord=2).square()
 
 
-def ista(D, x, lam, *, steps=1000, step=None, nonnegative=False, tol=0.0):
+def ista(
+    D: Tensor,
+    x: Tensor,
+    lam: float | Tensor,
+    *,
+    steps: int = 1000,
+    step_size: float | Tensor | None = None,
+    nonnegative: bool = False,
+    tol: float = 0.0,
+) -> Tensor:
     """Minimise ½‖x − D z‖² + λ‖z‖₁ by iterative shrinkage and thresholding from z = 0.
+
+    Daubechies et al., 2004, doi:10.1002/cpa.20042.
 
     Parameters
     ----------
@@ -81,7 +120,7 @@ def ista(D, x, lam, *, steps=1000, step=None, nonnegative=False, tol=0.0):
     lam : float or tensor broadcast against z
     steps : int
         At most so many iterations.
-    step : float, optional
+    step_size : float, optional
         α; default 1 / lipschitz(D). The threshold is α λ.
     nonnegative : bool
         Only codes z >= 0.
@@ -95,21 +134,50 @@ def ista(D, x, lam, *, steps=1000, step=None, nonnegative=False, tol=0.0):
     Raises
     ------
     ValueError
-        If the shapes do not fit or λ is negative.
+        If the shapes do not fit, λ is negative, `steps` is no whole number, or α is not above zero.
+
+    Examples
+    --------
+    >>> nl.sparse_coding.ista(torch.eye(3), torch.tensor([2.0, -0.5, 0.1]), 0.2).round(decimals=3) + 0
+    tensor([ 1.8000, -0.3000,  0.0000])
     """
-    return _plain(D, x, lam, steps, step, nonnegative, tol, accelerate=False)
+    return _plain(D, x, lam, steps, step_size, nonnegative, tol, accelerate=False)
 
 
-def fista(D, x, lam, *, steps=1000, step=None, nonnegative=False, tol=0.0):
-    """The minimum of `ista`, found faster: with momentum, error 1/k² (Beck & Teboulle, 2009).
+def fista(
+    D: Tensor,
+    x: Tensor,
+    lam: float | Tensor,
+    *,
+    steps: int = 1000,
+    step_size: float | Tensor | None = None,
+    nonnegative: bool = False,
+    tol: float = 0.0,
+) -> Tensor:
+    """The minimum of `ista`, found faster: with momentum, error 1/k².
 
-    The momentum is set back to zero for a problem whenever it points uphill (O'Donoghue & Candès,
-    2015), which makes the end of the run fast too. Parameters, result and errors as in `ista`.
+    Beck & Teboulle, 2009, doi:10.1137/080716542. The momentum is set back to zero for a problem whenever it points
+    uphill (O'Donoghue & Candès, 2015, doi:10.1007/s10208-013-9150-3), which makes the end of the run fast too.
+    Parameters, result and errors as in `ista`.
+
+    >>> nl.sparse_coding.fista(torch.eye(3), torch.tensor([2.0, -0.5, 0.1]), 0.2).round(decimals=3) + 0
+    tensor([ 1.8000, -0.3000,  0.0000])
     """
-    return _plain(D, x, lam, steps, step, nonnegative, tol, accelerate=True)
+    return _plain(D, x, lam, steps, step_size, nonnegative, tol, accelerate=True)
 
 
-def block_ista(D, W, lam, visible=None, *, exact=True, steps=1000, step=None, tol=0.0, accelerate=False):
+def block_ista(
+    D: Tensor,
+    W: Tensor,
+    lam: float | Tensor,
+    visible: Tensor | None = None,
+    *,
+    exact: bool = True,
+    steps: int = 1000,
+    step_size: float | Tensor | None = None,
+    tol: float = 0.0,
+    accelerate: bool = False,
+) -> Tensor:
     """Minimise ½‖Ω (W − Σ_k D_k Z_k)‖_F² + Σ_k λ_k ‖Z_k‖_F over block codes Z.
 
     Parameters
@@ -122,7 +190,7 @@ def block_ista(D, W, lam, visible=None, *, exact=True, steps=1000, step=None, to
     exact : bool
         As in `block_soft_threshold`. With False the result minimises no stated objective unless
         λ‖·‖₁ over entries is meant.
-    steps, step, tol : as in `ista`
+    steps, step_size, tol : as in `ista`
     accelerate : bool
         Use the momentum of `fista`.
 
@@ -133,17 +201,29 @@ def block_ista(D, W, lam, visible=None, *, exact=True, steps=1000, step=None, to
     Raises
     ------
     ValueError
-        If the shapes do not fit or λ is negative.
+        As `ista`; also if a visible point is not a finite number.
+
+    Examples
+    --------
+    >>> D = torch.zeros(2, 4, 3)
+    >>> D[0, 0, 0] = D[1, 1, 1] = 1.0  # one atom for each of two points
+    >>> W = torch.tensor([[[3.0, 4.0], [0.3, 0.4], [0.0, 0.0], [0.0, 0.0]]])
+    >>> nl.sparse_coding.block_ista(D, W, 1.0).norm(dim=(2, 3)).round(decimals=3)
+    tensor([[4., 0.]])
     """
+    steps, step_size, tol = _limits(steps, step_size, tol)
     if D.ndim != 3 or W.ndim != 3 or W.shape[1:] != (D.shape[1], 2):
         raise ValueError(f"D {tuple(D.shape)} and W {tuple(W.shape)} do not fit; expected (K, P, 3) and (B, P, 2).")
     lam = _threshold(lam, D)
     sharp = _sharp(D)  # (P, 3K)
     if visible is not None:
-        if visible.shape != W.shape[:2]:
-            raise ValueError(f"visible has shape {tuple(visible.shape)}; expected {tuple(W.shape[:2])}.")
+        checks.check_shape("visible", visible, tuple(W.shape[:2]))
+        if visible.dtype != torch.bool:
+            raise ValueError(f"visible has values of type {visible.dtype}; expected truth values.")
         W = torch.where(visible[..., None], W, 0.0)
-    step = 1 / lipschitz(D) if step is None else step
+    if not W.isfinite().all():
+        raise ValueError("W has visible points that are NaN or infinite; mark missing points as False in visible.")
+    step_size = 1 / lipschitz(D) if step_size is None else step_size
     blocks = (len(W), len(D), *D.shape[2:], 2)
 
     def gradient(Z):
@@ -151,14 +231,23 @@ def block_ista(D, W, lam, visible=None, *, exact=True, steps=1000, step=None, to
         return sharp.mT @ (residual if visible is None else residual * visible[..., None])
 
     def shrink(Z):
-        return block_soft_threshold(Z.view(blocks), step * lam, exact=exact).view_as(Z)
+        return block_soft_threshold(Z.view(blocks), step_size * lam, exact=exact).view_as(Z)
 
     start = W.new_zeros(len(W), sharp.shape[1], 2)
-    return _descend(start, gradient, shrink, step, steps, tol, accelerate, axes=(1, 2)).view(blocks)
+    return _descend(start, gradient, shrink, step_size, steps, tol, accelerate, axes=(1, 2)).view(blocks)
 
 
-def hierarchical_code(dictionaries, x, thresholds, *, nonnegative=True, steps=None):
+def hierarchical_code(
+    dictionaries: Sequence[Tensor],
+    x: Tensor,
+    thresholds: Sequence[float | Tensor],
+    *,
+    nonnegative: bool = True,
+    steps: int | None = None,
+) -> list[Tensor]:
     """Codes z_1 … z_N with x ≈ D_1 z_1, z_1 ≈ D_2 z_2, …, layer after layer.
+
+    Multi-layer sparse coding of Papyan et al., 2017, arXiv:1607.08194.
 
     Parameters
     ----------
@@ -178,6 +267,13 @@ def hierarchical_code(dictionaries, x, thresholds, *, nonnegative=True, steps=No
     ------
     ValueError
         If there are not as many thresholds as dictionaries, or the shapes do not fit.
+
+    Examples
+    --------
+    >>> first, second = nl.sparse_coding.hierarchical_code(
+    ...     [torch.eye(2), torch.ones(2, 1)], torch.tensor([1.0, -1.0]), [0.2, 0.3])
+    >>> first.round(decimals=3), second.round(decimals=3)
+    (tensor([0.8000, 0.0000]), tensor([0.5000]))
     """
     if len(dictionaries) != len(thresholds):
         raise ValueError(f"{len(dictionaries)} dictionaries, but {len(thresholds)} thresholds.")
@@ -192,7 +288,7 @@ def hierarchical_code(dictionaries, x, thresholds, *, nonnegative=True, steps=No
     return codes
 
 
-def mutual_coherence(D):
+def mutual_coherence(D: Any) -> float:
     """Largest absolute cosine between two different columns of D.
 
     Parameters
@@ -209,47 +305,81 @@ def mutual_coherence(D):
     ------
     ValueError
         If D is not a matrix of at least two columns.
+
+    Examples
+    --------
+    >>> round(nl.sparse_coding.mutual_coherence(torch.tensor([[1.0, 3.0], [0.0, 4.0]])), 3)
+    0.6
     """
     return _cosines(D).max().item()
 
 
-def babel(D, m):
+def babel(D: Any, m: int) -> float:
     """Babel function: the largest sum of m absolute cosines between one column and m others.
 
     ``babel(D, 1)`` is the mutual coherence. If ``babel(D, m) + babel(D, m − 1) < 1``, every code of
-    m atoms is recovered by ℓ1 (Tropp, 2004; chapter 05). D as in `mutual_coherence`.
+    m atoms is recovered by ℓ1 (Tropp, 2004, doi:10.1109/TIT.2004.834793; chapter 05). D as in `mutual_coherence`.
 
     Raises
     ------
     ValueError
-        If m is not between 1 and K − 1.
+        If m is not a whole number between 1 and K − 1.
+
+    Examples
+    --------
+    >>> round(nl.sparse_coding.babel(torch.tensor([[1.0, 3.0, 0.0], [0.0, 4.0, 1.0]]), 2), 3)
+    1.4
     """
     cosines = _cosines(D)
-    if not 1 <= m < len(cosines):
-        raise ValueError(f"m={m}; expected 1 … {len(cosines) - 1}.")
+    m = checks.whole("m", m, 1, len(cosines) - 1)
     return cosines.topk(m, dim=1).values.sum(1).max().item()
 
 
-def _plain(D, x, lam, steps, step, nonnegative, tol, accelerate):
+def _plain(
+    D: Tensor,
+    x: Tensor,
+    lam: float | Tensor,
+    steps: int,
+    step_size: float | Tensor | None,
+    nonnegative: bool,
+    tol: float,
+    accelerate: bool,
+) -> Tensor:
+    steps, step_size, tol = _limits(steps, step_size, tol)
     _check_plain(D, x)
     lam = _threshold(lam, x)
-    step = 1 / lipschitz(D) if step is None else step
+    step_size = 1 / lipschitz(D) if step_size is None else step_size
 
-    def gradient(z):
+    def gradient(z: Tensor) -> Tensor:
         return (z @ D.mT - x) @ D
 
-    def shrink(z):
-        return soft_threshold(z, step * lam, nonnegative=nonnegative)
+    def shrink(z: Tensor) -> Tensor:
+        return soft_threshold(z, step_size * lam, nonnegative=nonnegative)
 
     start = x.new_zeros(*x.shape[:-1], D.shape[1])
-    return _descend(start, gradient, shrink, step, steps, tol, accelerate, axes=(-1,))
+    return _descend(start, gradient, shrink, step_size, steps, tol, accelerate, axes=(-1,))
 
 
-def _descend(z, gradient, shrink, step, steps, tol, accelerate, axes):
+def _limits(steps: int, step_size: float | Tensor | None, tol: float) -> tuple[int, float | Tensor | None, float]:
+    if step_size is not None:
+        checks.at_least("step_size", step_size, above=True)
+    return checks.whole("steps", steps, 0), step_size, checks.at_least("tol", tol)
+
+
+def _descend(
+    z: Tensor,
+    gradient: Callable[[Tensor], Tensor],
+    shrink: Callable[[Tensor], Tensor],
+    step_size: float | Tensor,
+    steps: int,
+    tol: float,
+    accelerate: bool,
+    axes: tuple[int, ...],
+) -> Tensor:
     """Gradient step, then shrinkage; with momentum if accelerated. `axes` are those of one problem."""
     ahead, t = z, torch.ones_like(z.sum(axes, keepdim=True))  # where the gradient is taken; Nesterov's sequence
     for _ in range(steps):
-        new = shrink(ahead - step * gradient(ahead))
+        new = shrink(ahead - step_size * gradient(ahead))
         move = new - z
         if accelerate:
             t_new = (1 + (1 + 4 * t * t).sqrt()) / 2
@@ -264,26 +394,27 @@ def _descend(z, gradient, shrink, step, steps, tol, accelerate, axes):
     return z
 
 
-def _check_plain(D, x):
+def _check_plain(D: Tensor, x: Tensor) -> None:
     if D.ndim != 2 or x.shape[-1:] != D.shape[:1]:
         raise ValueError(f"D {tuple(D.shape)} and x {tuple(x.shape)} do not fit; expected (n, K) and (..., n).")
 
 
-def _threshold(tau, like):
+def _threshold(tau: float | Tensor, like: Tensor) -> Tensor:
     tau = torch.as_tensor(tau, dtype=like.dtype, device=like.device)
-    if (tau < 0).any():
-        raise ValueError("a threshold is negative; expected 0 or more.")
+    if not (tau >= 0).all():  # so that NaN is refused, too
+        raise ValueError("a threshold is negative or NaN; expected 0 or more.")
     return tau
 
 
-def _sharp(D):
+def _sharp(D: Tensor) -> Tensor:
     """D♯ (P, 3K) of a first dictionary (K, P, 3); a matrix stays as it is."""
     return D if D.ndim == 2 else D.permute(1, 0, 2).reshape(D.shape[1], -1)
 
 
-def _cosines(D):
+def _cosines(D: Any) -> Tensor:
     """(K, K) absolute cosines between the columns of D, zero on the diagonal."""
     D = torch.as_tensor(D).detach()
+    D = D if D.is_floating_point() else D.double()
     if D.ndim != 2 or D.shape[1] < 2:
         raise ValueError(f"D has shape {tuple(D.shape)}; expected (n, K) with K >= 2.")
     unit = torch.nn.functional.normalize(D, dim=0)

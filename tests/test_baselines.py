@@ -1,16 +1,61 @@
 """Each method is exact on data made from its own model, and says when it cannot."""
 
+import inspect
+from collections import Counter
+
 import numpy as np
 import pytest
 
 import nrsfm_lite as nl
+from nrsfm_lite import image_prior, images, normalizer
 from nrsfm_lite.baselines import complete, tomasi_kanade
+
+METHODS = [name for name in nl.baselines.__all__ if name != "complete"]
+QUICK = {  # as little as a method can do
+    "bmm": {"rank": 2, "restarts": 1},
+    "cns": {"groups_per_point": 1},
+    "ksta": {"rank": 2},
+    "nlo": {"rank": 2},
+    "pta": {"rank": 2},
+    "riks": {"rank": 2},
+    "sfc": {"rank": 1},
+    "sps": {"atoms": 4, "restarts": 1},
+}
 
 
 @pytest.fixture
 def rigid(rng):
     S = np.repeat(rng.normal(size=(1, 9, 3)), 30, axis=0)
     return nl.datasets.make_views(nl.Landmarks(points3d=S, edges=[(0, 1)]))
+
+
+@pytest.mark.parametrize("name", nl.baselines.__all__)
+def test_every_method_has_the_same_signature(name):
+    parameters = inspect.signature(getattr(nl.baselines, name)).parameters
+    assert list(parameters)[:3] == ["W", "visible", "confidence"]
+    assert all(p.kind is p.KEYWORD_ONLY for p in list(parameters.values())[2:])
+    assert parameters["visible"].default is None and parameters["confidence"].default is None
+    if name != "complete":
+        assert parameters["progress"].default is True
+        assert name in ("tomasi_kanade", "pta") or parameters["max_seconds"].default is None
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_points_are_read_centred_and_filled_in_no_more_often_than_needed(name, rng, monkeypatch):
+    views = nl.datasets.make_views(nl.datasets.make_motion(40, seed=0), missing=0.1, seed=0)
+    calls = Counter()
+    for module, function in [(images, "parse"), (normalizer, "center"), (image_prior, "fill")]:
+        original = getattr(module, function)
+
+        def counted(*args, original=original, function=function):
+            calls[function] += 1
+            return original(*args)
+
+        monkeypatch.setattr(module, function, counted)
+    rec = getattr(nl.baselines, name)(views, **QUICK.get(name, {}), progress=False)
+    assert rec.method == name and rec.names == views.names
+    assert calls["parse"] == 1 and calls["center"] <= 2 and calls["fill"] <= 1
+    assert calls["fill"] == (name != "sfc")
 
 
 def test_exact_on_a_rigid_object(rigid):

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import nrsfm_lite as nl
-from nrsfm_lite.baselines import weak
-from nrsfm_lite.baselines.cns import cns, consensus, group_signs, sample_groups
+from nrsfm_lite.baselines import _cns_groups, cns
+from nrsfm_lite.baselines._cns import consensus, group_signs, sample_groups
 
 
 def low_rank(rng, frames=100, points=14, amount=0.3, **views):
@@ -53,7 +53,7 @@ def test_groups_are_local(rng):
 def test_nearest_factor(rng):
     Q = rng.normal(size=(4, 6, 6))
     Q = Q + Q.swapaxes(1, 2)
-    factor = weak._nearest_factor(Q)
+    factor = _cns_groups._nearest_factor(Q)
     near = factor @ factor.swapaxes(1, 2)
     np.testing.assert_allclose(np.trace(near, axis1=1, axis2=2), 1)
     np.testing.assert_allclose(np.linalg.eigvalsh(near)[:, :3], 0, atol=1e-12)
@@ -67,7 +67,7 @@ def test_nearest_factor(rng):
 def test_constraints_keep_the_sum_of_squares(rng):
     U, Q = torch.tensor(rng.normal(size=(2, 30, 2, 6))), rng.normal(size=(6, 6))
     Q = Q + Q.T
-    A, size = weak.constraints(U)
+    A, size = _cns_groups.constraints(U)
     gram = U.numpy() @ Q @ U.numpy().swapaxes(2, 3)
     squares = (gram[:, :, 0, 0] - gram[:, :, 1, 1]) ** 2 + 4 * gram[:, :, 0, 1] ** 2
     np.testing.assert_allclose(((A @ Q.ravel()) ** 2).sum(1) * size, squares.sum(1))
@@ -78,7 +78,9 @@ def test_depths_of_one_group_with_true_cameras(rng):
     data = low_rank(rng, points=10)
     M, W = torch.tensor(data.cameras), torch.tensor(data.points2d - data.points2d.mean(1, keepdims=True))
     view = torch.linalg.cross(M[..., 0], M[..., 1])
-    z = weak.lowest_rank_depths((W @ M.mT).permute(2, 1, 0)[None].contiguous(), view.T[None].contiguous())[0].numpy()
+    z = _cns_groups.lowest_rank_depths((W @ M.mT).permute(2, 1, 0)[None].contiguous(), view.T[None].contiguous())[
+        0
+    ].numpy()
     true = nl.cameras.nearness(data.points3d, data.cameras).T
     true -= true.mean(0)
     assert np.linalg.norm(z - z.mean(0) - true) < 1e-4 * np.linalg.norm(true)
@@ -130,7 +132,7 @@ def test_no_more_points_than_a_group(rng):
 
 
 def test_missing_points_are_filled_in(rng, monkeypatch):
-    monkeypatch.setattr(weak, "_UPGRADE_STEPS", 3000)  # enough for completed points
+    monkeypatch.setattr(_cns_groups, "_UPGRADE_STEPS", 3000)  # enough for completed points
     cosine = np.cos(np.linspace(0, 9, 60))[:, None, None]
     data = rng.normal(size=(12, 3)) + 0.2 * cosine * rng.normal(size=(12, 3))
     data = nl.datasets.make_views(nl.Landmarks(points3d=data))

@@ -1,6 +1,5 @@
 """Bundle adjustment of a low-rank shape: its derivatives, exact on its own model, bounded on what is not."""
 
-import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -8,11 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import nrsfm_lite as nl
-from nrsfm_lite.baselines import tomasi_kanade
-from nrsfm_lite.baselines.limits import Watch
-from nrsfm_lite.baselines.nlo import nlo
-
-module = importlib.import_module("nrsfm_lite.baselines.nlo")  # its function hides it
+from nrsfm_lite.baselines import _nlo, nlo, tomasi_kanade
+from nrsfm_lite.baselines.shared.limits import Watch
+from nrsfm_lite.images import read
 
 
 def mild_motion(rng, frames=80, points=15, rank=2, amplitude=0.3):
@@ -28,37 +25,26 @@ def error(rec, data):
 
 
 def random_problem(rng, F=6, P=5, K=3, hidden=0.2):
-    seen = (rng.random((F, P)) >= hidden).astype(float)
-    seen[:, 0] = 1
-    state = module._State(
+    weight = rng.random((F, P)) * (rng.random((F, P)) >= hidden)
+    weight[:, 0] = 1
+    state = _nlo._State(
         Q=Rotation.random(F, rng=rng).as_matrix(),
-        weights=np.column_stack([np.ones(F), rng.normal(size=(F, K - 1))]),
+        coefficients=np.column_stack([np.ones(F), rng.normal(size=(F, K - 1))]),
         atoms=rng.normal(size=(K, P, 3)),
         t=rng.normal(size=(F, 2)),
     )
-    X = rng.normal(size=(F, P, 2)) * seen[..., None]
-    return state, module._Problem(X, seen, prior=0.02, mean_prior=0.05, mean=rng.normal(size=(P, 3)))
-
-
-def moved(s, own, atoms):
-    """The state after a change of each frame's own unknowns (F, n) and of the atoms."""
-    turn, weights, t = np.split(own, [3, len(s.atoms) + 2], axis=1)
-    return module._State(
-        Q=s.Q @ Rotation.from_rotvec(turn).as_matrix().swapaxes(1, 2),
-        weights=s.weights + np.column_stack([np.zeros(len(t)), weights]),
-        atoms=s.atoms + atoms,
-        t=s.t + t,
-    )
+    X = rng.normal(size=(F, P, 2))
+    return state, _nlo._Problem(X, weight, prior=0.02, mean_prior=0.05, mean=rng.normal(size=(P, 3)))
 
 
 def test_jacobian_against_finite_differences(rng):
     s, problem = random_problem(rng)
-    J = module._jacobian(s, problem.seen)
+    J = _nlo._jacobian(s)
     step = 1e-6
     for i in range(J.shape[3]):
         own = np.zeros((len(s.t), J.shape[3]))
         own[:, i] = step
-        ahead, behind = (module._residual(moved(s, sign * own, 0), problem) for sign in (1, -1))
+        ahead, behind = (_nlo._residual(s.moved(sign * own, 0), problem) for sign in (1, -1))
         np.testing.assert_allclose(J[..., i], (behind - ahead) / (2 * step), atol=1e-8)
 
 
@@ -69,22 +55,23 @@ def test_a_step_is_the_damped_solution_of_the_whole_system(rng):
     size = F * n + s.atoms.size
 
     def residuals(change):
-        new = moved(s, change[: F * n].reshape(F, n), change[F * n :].reshape(s.atoms.shape))
-        strength, away = problem.pull(new.atoms)
-        priors = np.sqrt(problem.on_weights) * new.weights[:, 1:], np.sqrt(strength) * away
-        return np.concatenate([module._residual(new, problem).ravel(), *(p.ravel() for p in priors)])
+        new = s.moved(change[: F * n].reshape(F, n), change[F * n :].reshape(s.atoms.shape))
+        strength, away = problem.on_atoms(new.atoms)
+        priors = np.sqrt(problem.on_coefficients) * new.coefficients[:, 1:], np.sqrt(strength) * away
+        seen = _nlo._residual(new, problem) * np.sqrt(problem.weight)[..., None]
+        return np.concatenate([seen.ravel(), *(p.ravel() for p in priors)])
 
-    assert (residuals(np.zeros(size)) ** 2).sum() / 2 == pytest.approx(module._objective(s, problem))
+    assert (residuals(np.zeros(size)) ** 2).sum() / 2 == pytest.approx(_nlo._objective(s, problem))
     J = np.stack([(residuals(e) - residuals(-e)) / 2e-6 for e in 1e-6 * np.eye(size)], 1)
     H = J.T @ J
     extra = damping * (
-        np.diag(H) + module._FLOOR * np.r_[np.full(F * n, len(problem.seen[0])), np.full(s.atoms.size, F)]
+        np.diag(H) + _nlo._FLOOR * np.r_[np.full(F * n, len(problem.weight[0])), np.full(s.atoms.size, F)]
     )
     extra[: F * n].reshape(F, n)[:, -2:] = 0  # translations are not damped
     change = -np.linalg.solve(H + np.diag(extra), J.T @ residuals(np.zeros(size)))
-    expected = moved(s, change[: F * n].reshape(F, n), change[F * n :].reshape(s.atoms.shape))
-    found = module._step(s, problem, damping)
-    for name in ("Q", "weights", "atoms", "t"):
+    expected = s.moved(change[: F * n].reshape(F, n), change[F * n :].reshape(s.atoms.shape))
+    found = _nlo._step(s, problem, damping)
+    for name in ("Q", "coefficients", "atoms", "t"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-6)
 
 
@@ -126,13 +113,13 @@ def test_units_do_not_matter_and_come_back(rng):
 
 def test_each_descent_lowers_the_objective_and_adding_an_atom_raises_it_little(rng):
     data = mild_motion(rng, rank=3)
-    images = module.read(data, fill=False)
-    rigid = module._rigid(images)
-    problem = module._Problem(images.X, images.visible.astype(float), 1e-3, 1e-3, rigid.atoms[0])
-    better, _ = module._descend(rigid, problem, Watch("nlo", progress=False))
-    assert module._objective(better, problem) < module._objective(rigid, problem)
-    wider = module._add_atom(better, replace(problem, prior=0.0))
-    assert module._objective(wider, replace(problem, prior=0.0)) < module._objective(better, problem)
+    images = read(data, method="nlo")
+    rigid = _nlo._rigid(images)
+    problem = _nlo._Problem(images.X, images.weight, 1e-3, 1e-3, rigid.atoms[0])
+    better, _ = _nlo._descend(rigid, problem, Watch("nlo", progress=False))
+    assert _nlo._objective(better, problem) < _nlo._objective(rigid, problem)
+    wider = _nlo._add_atom(better, replace(problem, prior=0.0))
+    assert _nlo._objective(wider, replace(problem, prior=0.0)) < _nlo._objective(better, problem)
 
 
 def test_a_rigid_object_needs_no_atoms(rng):

@@ -1,15 +1,11 @@
 """Structure from category: its steps against plain ones, exact where it can be, and what it does with the rest."""
 
-import importlib
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 
 import nrsfm_lite as nl
-from nrsfm_lite.baselines.sfc import sfc
-
-module = importlib.import_module("nrsfm_lite.baselines.sfc")  # its function hides it
+from nrsfm_lite.baselines import _sfc, sfc
 
 
 def rigid_views(rng, stretch=(1, 1, 1), frames=120, points=12):
@@ -36,7 +32,7 @@ def test_the_prox_is_that_of_singular_values(rng):
         meet = np.maximum((a + b - threshold) / 2, 0)
         low = np.where((a - b <= threshold)[..., None], meet[..., None], np.stack([a - threshold, b], -1))
         expected = (U * low[..., None, :]) @ Vh
-        found = module._prox(N, threshold).reshape(30, 2, 4, 3).transpose(0, 2, 1, 3)
+        found = _sfc._prox(N, threshold).reshape(30, 2, 4, 3).transpose(0, 2, 1, 3)
         np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
@@ -46,7 +42,7 @@ def test_the_prox_is_a_minimum(rng):
     def value(m):
         return ((m - N) ** 2).sum() / 2 + 0.7 * np.linalg.norm(m.reshape(2, 3), 2)
 
-    found = module._prox(N.reshape(1, 2, 3), 0.7)
+    found = _sfc._prox(N.reshape(1, 2, 3), 0.7)
     assert value(found.ravel()) <= minimize(value, found.ravel(), method="Nelder-Mead").fun + 1e-9
 
 
@@ -54,12 +50,12 @@ def test_the_prox_is_a_minimum(rng):
 def test_ridge_regressions_solve_their_equations(rng, hidden):
     F, P, n = 7, 9, 6
     Z, B = rng.normal(size=(F, 2, n)), rng.normal(size=(n, P))
-    seen = (rng.random((F, 1, P)) >= hidden).astype(float)
-    target = rng.normal(size=(F, 2, P)) * seen
-    codes = module._codes(B, target, seen, Z, 0.3)  # with Z as the pull
-    np.testing.assert_allclose((target - codes @ B * seen) @ B.T + Z - 0.3 * codes, 0, atol=1e-9)
-    atoms = module._atoms(Z, target, seen, B, 0.3)
-    gradient = np.einsum("fin,fip->np", Z, target - Z @ atoms * seen) + B - 0.3 * atoms
+    weight = rng.random((F, 1, P)) * (rng.random((F, 1, P)) >= hidden) if hidden else np.ones((F, 1, P))
+    target = rng.normal(size=(F, 2, P)) * weight
+    codes = _sfc._codes(B, target, weight, Z, 0.3)  # with Z as the linear term
+    np.testing.assert_allclose((target - codes @ B * weight) @ B.T + Z - 0.3 * codes, 0, atol=1e-9)
+    atoms = _sfc._atoms(Z, target, weight, B, 0.3)
+    gradient = np.einsum("fin,fip->np", Z, target - Z @ atoms * weight) + B - 0.3 * atoms
     np.testing.assert_allclose(gradient, 0, atol=1e-9)
 
 
@@ -103,17 +99,17 @@ def test_units_do_not_matter_and_come_back(rng):
 def test_restarts_take_the_lowest_objective_and_the_seed_decides(rng, monkeypatch):
     data = rigid_views(rng, frames=40)
     values = []
-    descend = module._descend
+    descend = _sfc._descend
 
     def recorded(*args):
         result = descend(*args)
         values.append((result[1], result[0]))
         return result
 
-    monkeypatch.setattr(module, "_descend", recorded)
+    monkeypatch.setattr(_sfc, "_descend", recorded)
     rec = sfc(data, rank=3, restarts=3, progress=False)
     assert len(values) == 3
-    S = module._shapes(min(values, key=lambda pair: pair[0])[1])
+    S = _sfc._shapes(min(values, key=lambda pair: pair[0])[1])
     assert nl.metrics.normalized_error(rec.shapes, S).max() < 1e-6
     np.testing.assert_array_equal(sfc(data, rank=3, restarts=3, progress=False).shapes, rec.shapes)
     assert not np.array_equal(sfc(data, rank=3, seed=1, progress=False).shapes, rec.shapes)
@@ -133,7 +129,7 @@ def test_what_it_cannot_do_is_said(rng):
         ({"rank": 0}, "rank=0; expected a whole number"),
         ({"rank": 1.5}, r"rank=1.5; expected a whole number"),
         ({"restarts": 0}, "restarts=0"),
-        ({"penalty": 0}, "penalty=0; expected a positive number"),
+        ({"penalty": 0}, "penalty=0; expected a number above 0"),
         ({"rank": 2, "upgrade": True}, "upgrade=True with rank=2"),
         ({"max_seconds": 0}, "max_seconds=0"),
     ]:

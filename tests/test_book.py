@@ -44,6 +44,14 @@ def test_cells_are_short(path):
 
 
 @each_notebook
+def test_nothing_is_said_or_checked_in_a_folded_cell(path):
+    # A reader sees only the picture that it makes. What is printed or asserted belongs where it can be read.
+    for cell in code_cells(path):
+        if any(tag.startswith(("hide-", "remove-")) for tag in cell.metadata.get("tags", [])):
+            assert not re.search(r"\bprint\(|\bassert\b|\.assert_|\bassert_close\(", cell.source), cell.source
+
+
+@each_notebook
 def test_every_figure_has_alt_text_a_caption_and_a_name(path):
     draws = re.compile(r"plt\.show\(\)|\bshow3d\(|\.show\(\)")
     for cell in code_cells(path):

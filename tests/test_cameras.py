@@ -108,3 +108,35 @@ def test_rotation_error_measures_one_wrong_camera():
     spin = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     wrong[0] = M[0] @ spin
     assert cameras.rotation_error(wrong, M)[0] == pytest.approx(30, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: cameras.random_rotations(2.5), "n=2.5"),
+        (lambda: cameras.random_cameras(3, seed=0.5), "seed=0.5"),
+        (lambda: cameras.random_cameras(3, seed=-1), "seed=-1"),
+        (lambda: cameras.image_turns(torch.zeros(2, 2)), r"angle has shape \(2, 2\)"),
+        (lambda: cameras.project(np.zeros((4, 2)), np.zeros((3, 2))), r"S has shape \(4, 2\)"),
+        (lambda: cameras.project(np.zeros((4, 3)), np.zeros((3, 2)), np.zeros(3)), r"t \(3,\)"),
+        (lambda: cameras.camera_frame(np.zeros((5, 4, 3)), np.zeros((1, 3, 2))), r"expected \(F, P, 3\)"),
+        (lambda: cameras.nearness(np.zeros((4, 3)), np.zeros((3, 2))), r"expected \(F, P, 3\)"),
+        (lambda: cameras.rotations(np.zeros((5, 2, 3))), r"expected \(\.\.\., 3, 2\)"),
+        (lambda: cameras.rotation_error(np.zeros((5, 3, 2)), np.zeros((4, 3, 2))), "twice"),
+        (
+            lambda: cameras.rotation_error(np.full((5, 3, 2), np.nan), np.zeros((5, 3, 2))),
+            "M has 30 values that are not",
+        ),
+    ],
+)
+def test_wrong_input_is_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_seeds_may_be_numpys_and_shapes_tensors():
+    M = cameras.random_cameras(np.int64(3), seed=np.int32(4))
+    np.testing.assert_array_equal(M, cameras.random_cameras(3.0, seed=4))
+    S = torch.ones(3, 5, 3)
+    np.testing.assert_allclose(cameras.camera_frame(S, torch.as_tensor(M))[..., :2], S.numpy() @ M)
+    np.testing.assert_allclose(cameras.rotation_error(torch.as_tensor(M), M, degrees=False), 0, atol=1e-7)

@@ -89,12 +89,27 @@ def test_generated_motion_is_no_easier_than_motion_capture(real_data):
 
 
 def test_motion_refuses(motion):
-    with pytest.raises(ValueError, match="n_frames=0"):
-        datasets.make_motion(0)
+    for n_frames in (0, 10.5, "10", np.nan):
+        with pytest.raises(ValueError, match="n_frames="):
+            datasets.make_motion(n_frames)
+    with pytest.raises(ValueError, match=r"seed=0\.5"):
+        datasets.make_motion(10, seed=0.5)
     with pytest.raises(ValueError, match="expected a sequence"):
         datasets.make_motion(10, actions="walk")
     with pytest.raises(KeyError, match="unknown action 'swim'"):
         datasets.make_motion(10, actions=["walk", "swim"])
+
+
+def test_time_runs_at_thirty_frames_per_second_in_each_sequence(motion):
+    for i in (0, 1):
+        np.testing.assert_allclose(motion.time[motion.sequence == i], np.arange(200) / 30)
+    assert datasets.make_views(motion).time.tolist() == motion.time.tolist()
+
+
+def test_seeds_may_be_numpys(motion):
+    np.testing.assert_array_equal(datasets.make_motion(np.int64(400), seed=np.uint8(1)).points3d, motion.points3d)
+    views = datasets.make_views(motion, seed=np.int32(4))
+    np.testing.assert_array_equal(views.points2d, datasets.make_views(motion, seed=4).points2d)
 
 
 def test_views_are_projections_of_the_truth(motion):
@@ -175,6 +190,14 @@ def test_perspective_is_a_pinhole_and_far_away_orthographic(motion):
         ({"translation_range": -1}, "translation_range=-1"),
         ({"noise": np.nan}, "noise=nan"),
         ({"missing": "many"}, "missing='many'"),
+        ({"missing": np.nan}, "missing=nan"),
+        ({"seed": 1.5}, "seed=1.5"),
+        ({"translation_range": np.inf}, "translation_range=inf"),
+        ({"translation_range": (1, 2)}, r"translation_range=\(1, 2\)"),
+        ({"noise": "some"}, "noise='some'"),
+        ({"projection": "weak_perspective", "scale_range": 2}, "scale_range=2"),
+        ({"projection": "weak_perspective", "scale_range": (1, np.inf)}, "0 < low <= high"),
+        ({"projection": "weak_perspective", "scale_range": (1, 2, 3)}, "expected a pair"),
     ],
 )
 def test_views_refuse(motion, more, message):
@@ -185,6 +208,8 @@ def test_views_refuse(motion, more, message):
 def test_views_need_3d(rng):
     with pytest.raises(ValueError, match="needs Landmarks with points3d"):
         datasets.make_views(nl.Landmarks(points2d=rng.normal(size=(3, 4, 2))))
+    with pytest.raises(ValueError, match="at least one frame"):
+        datasets.make_views(nl.Landmarks(points3d=np.zeros((0, 4, 3))))
 
 
 def test_npz_of_a_user(rng, tmp_path):

@@ -98,8 +98,12 @@ def test_joints_and_every(arm):
     assert data.edges.tolist() == [[1, 0]]  # the dropped elbow is bridged
     with pytest.raises(KeyError, match="no joint named wrist"):
         datasets.load_bvh(arm, joints=["wrist"])
-    with pytest.raises(ValueError, match="every=0"):
-        datasets.load_bvh(arm, every=0)
+    for every in (0, 1.5, "2", True):
+        with pytest.raises(ValueError, match="every="):
+            datasets.load_bvh(arm, every=every)
+    for joints, message in [((), "joints is empty"), (("elbow", "elbow"), "joints has 'elbow' twice")]:
+        with pytest.raises(ValueError, match=message):
+            datasets.load_bvh(arm, joints=joints)
 
 
 def test_edges_bridge_what_is_dropped():
@@ -112,6 +116,45 @@ def test_two_end_sites_under_one_joint_are_two_points(arm):
     data = datasets.load_bvh(arm)
     assert data.names[2:] == ("elbow_end", "elbow_end_2")
     np.testing.assert_allclose(data.points3d[0, 2:], [[2, 10, 0], [3, 1, 0]], atol=1e-12)
+
+
+def chain(*labels):
+    """A file of one chain of joints with these labels, each with an end site of its own."""
+    text = "HIERARCHY\n"
+    for i, label in enumerate(labels):
+        text += f"{'JOINT' if i else 'ROOT'} {label}\n{{\n OFFSET 1 0 0\n CHANNELS 1 Xposition\n"
+        text += " End Site\n {\n  OFFSET 0 1 0\n }\n"
+    return text + "}\n" * len(labels) + f"MOTION\nFrames: 1\nFrame Time: .01\n{'0 ' * len(labels)}\n"
+
+
+@pytest.mark.parametrize(
+    ("labels", "joints"),
+    [
+        (("hand", "hand"), ["hand", "hand_2"]),
+        (("a", "a_3", "a"), ["a", "a_3", "a_2"]),
+        (("a", "a_3", "a", "a"), ["a", "a_3", "a_2", "a_4"]),
+        (("a", "a", "a_2"), ["a", "a_3", "a_2"]),
+        (("a", "a", "a_2", "a"), ["a", "a_3", "a_2", "a_4"]),
+        (("a", "a_end"), ["a", "a_end"]),
+    ],
+)
+def test_joints_of_one_name_are_counted(arm, labels, joints):
+    arm.write_text(chain(*labels))
+    names = datasets.load_bvh(arm).names
+    assert len(set(names)) == len(names)
+    assert list(names[::2]) == joints
+    ends = [f"{j}_end" for j in joints]
+    assert list(names[1::2]) == [f"{e}_2" if e in joints else e for e in ends]
+
+
+def test_time_is_that_of_each_file(arm, tmp_path):
+    assert datasets.load_bvh(arm).time.tolist() == [0, 0.0333]
+    (tmp_path / "slow.bvh").write_text(ARM.replace("0.0333", "0.5"))
+    assert datasets.load_bvh(tmp_path).time.tolist() == [0, 0.0333, 0, 0.5]
+    arm.write_text(ARM.replace("Frames: 2", "Frames: 4") + 2 * "1 1 1  0 0 0  0 0 0\n")
+    np.testing.assert_allclose(datasets.load_bvh(arm, every=3).time, [0, 3 * 0.0333])
+    (tmp_path / "slow.bvh").write_text(ARM.replace("0.0333", "0"))
+    assert datasets.load_bvh(tmp_path).time is None
 
 
 def test_a_byte_order_mark_is_no_obstacle(arm):
@@ -149,6 +192,8 @@ def test_a_folder_and_a_list(arm, tmp_path):
         (ARM.replace("5 6 7", "5 six 7"), "line 20: expected a number, found 'six'"),
         (ARM.replace("5 6 7", "5 nan 7"), "line 20: a motion value is nan"),
         (ARM.replace("OFFSET 2 0 0", "OFFSET 2 nan 0"), "line 8: expected a number, found 'nan'"),
+        (ARM.replace("CHANNELS 6", "CHANNELS 6.5"), "line 5: expected a whole number of channels, found 6.5"),
+        (ARM.replace("0.0333", "soon"), "line 18: expected 'Frame Time"),
         (ARM.replace("CHANNELS 6", "CHANNELS inf"), "line 5: expected a number, found 'inf'"),
         (
             ARM.replace("Zrotation Yrotation Xrotation", "Zrotation Zrotation Xrotation"),

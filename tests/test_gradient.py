@@ -52,7 +52,7 @@ def test_the_papers_own_loss_without_bias_in_float32(batch):
     net = network(torch.float, output_bias=False)
     X = batch[0].float()
     expected, gradients = by_autograd(net, X, None, torch.ones(11))
-    torch.testing.assert_close(backpropagate(net, X, None, torch.ones(11)), expected.detach())
+    torch.testing.assert_close(backpropagate(net, X, size=torch.ones(11)), expected.detach())
     for p, g in zip([p for p in net.parameters() if p.requires_grad], gradients, strict=True):
         torch.testing.assert_close(p.grad, g, rtol=1e-4, atol=1e-6)
     assert net.output_bias.grad is None
@@ -63,7 +63,7 @@ def test_the_pull_to_the_mean_shape_is_in_the_gradient_only(batch):
     X, visible = batch
     size = X.flatten(1).norm(dim=1)
     expected, gradients = by_autograd(net, X, visible, size, pull=0.7)
-    torch.testing.assert_close(backpropagate(net, X, visible, size, 0.7), expected.detach())
+    torch.testing.assert_close(backpropagate(net, X, visible, size=size, pull=0.7), expected.detach())
     for p, g in zip(net.parameters(), gradients, strict=True):
         torch.testing.assert_close(p.grad, g, rtol=1e-10, atol=1e-12)
 
@@ -98,5 +98,5 @@ def test_a_frame_hit_exactly_and_a_dead_network_have_finite_gradients():
         for b in net.decoder_threshold:
             b.zero_()
     X = torch.zeros(3, 7, 2, dtype=torch.double)
-    loss = backpropagate(net, X, None, torch.ones(3, dtype=torch.double))
+    loss = backpropagate(net, X, size=torch.ones(3, dtype=torch.double))
     assert loss == 0 and all(torch.isfinite(p.grad).all() for p in net.parameters())

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
@@ -56,6 +57,8 @@ def test_the_error_of_some_points_and_of_the_others_make_that_of_all(rng):
     np.testing.assert_allclose(share * some[1:] ** 2 + (1 - share) * rest[1:] ** 2, whole[1:] ** 2)
     with pytest.raises(ValueError, match=r"points has shape \(6, 8\)"):
         metrics.normalized_error(S, S_true, points=hidden[:, :8])
+    with pytest.raises(ValueError, match="points cannot be read as an array of truth values"):
+        metrics.normalized_error(S, S_true, points=np.where(hidden, 0.5, 0))
 
 
 def test_mpjpe_by_hand():
@@ -83,10 +86,58 @@ def test_pa_mpjpe_is_the_least_squares_similarity(rng):
 def test_handedness_counts_the_minority(rng):
     S = rng.normal(size=(10, 9, 3))
     flipped = S @ random_rotations(10)
-    assert metrics.handedness(flipped, S) == 0
-    assert metrics.handedness(-flipped, S) == 0  # all mirrored: a convention, not an error
+    assert metrics.handedness(flipped, S) == (0, 0)
+    assert metrics.handedness(-flipped, S) == (0, 0)  # all mirrored: a convention, not an error
     flipped[:3] *= (1, 1, -1)
-    assert metrics.handedness(flipped, S) == pytest.approx(0.3)
+    assert metrics.handedness(flipped, S).mirrored == pytest.approx(0.3)
+
+
+def test_flat_frames_have_no_handedness(rng):
+    """A flat shape is its own mirror image; what is left of its depth is noise, and so is the sign."""
+    S = rng.normal(size=(40, 9, 3))
+    S[10:] *= (1, 1, 0)
+    S = S @ random_rotations(40)
+    seen = S + 1e-9 * rng.normal(size=S.shape)
+    seen[:3] = -seen[:3]
+    found = metrics.handedness(seen, S)
+    assert found.mirrored == pytest.approx(0.3) and found.left_out == pytest.approx(0.75)
+    nothing = metrics.handedness(seen[10:], S[10:])
+    assert np.isnan(nothing.mirrored) and nothing.left_out == 1
+
+
+def test_a_frame_counts_for_handedness_from_a_tenth_on(rng):
+    """The distance of a thin shape from its mirror image grows with its depth."""
+    flat = rng.normal(size=(1, 9, 3)) * (1, 1, 0)
+    depth = rng.normal(size=(1, 9, 3)) * (0, 0, 1)
+    for share in (0.01, 0.03, 0.1, 0.3):
+        S = flat + share * depth
+        own = metrics.normalized_error(S * (1, 1, -1), S, reflections=False)
+        assert (metrics.handedness(S, S).left_out == 0) == (own[0] > 0.1)
+
+
+def test_the_error_with_rotations_only_forgives_one_mirror_image_for_all_frames(rng):
+    S = rng.normal(size=(10, 9, 3))
+    moved = 3 * S @ random_rotations(10) + rng.normal(size=(10, 1, 3))
+    for hand in (moved, -moved, torch.as_tensor(moved * (1, -1, 1))):
+        np.testing.assert_allclose(metrics.rotation_only_error(hand, S), 0, atol=1e-12)
+    moved[:3] *= (1, 1, -1)
+    for hand in (moved, -moved):
+        error = metrics.rotation_only_error(hand, S)
+        np.testing.assert_allclose(error[3:], 0, atol=1e-12)
+        expected = [brute_force(-a, a, True, False) for a in S[:3]]
+        np.testing.assert_allclose(error[:3], expected, rtol=1e-6)
+    assert (metrics.rotation_only_error(moved, S, scale=False) > 0.1).all()
+
+
+def test_the_hand_of_the_whole_is_chosen_by_all_points(rng):
+    S = rng.normal(size=(6, 9, 3))
+    noisy = -S + 0.1 * rng.normal(size=S.shape)
+    some = rng.random((6, 9)) < 0.5
+    half, rest = (metrics.rotation_only_error(noisy, S, points=p) for p in (some, ~some))
+    whole = metrics.rotation_only_error(noisy, S)
+    share = some.mean(1)
+    np.testing.assert_allclose(share * half**2 + (1 - share) * rest**2, whole**2)
+    assert (whole < 0.3).all()
 
 
 def test_a_flat_prediction_has_a_finite_error(rng):
@@ -98,7 +149,10 @@ def test_a_flat_prediction_has_a_finite_error(rng):
     [
         (np.zeros((1, 5, 3)), np.zeros((1, 4, 3)), "have shapes"),
         (np.zeros((1, 5, 2)), np.zeros((1, 5, 2)), r"expected \(F, P, 3\)"),
-        (np.full((1, 5, 3), np.nan), np.ones((1, 5, 3)), "finite"),
+        (np.full((1, 5, 3), np.nan), np.ones((1, 5, 3)), "S has 15 values that are not finite"),
+        (np.ones((1, 5, 3)), np.full((1, 5, 3), np.inf), "S_true has 15 values that are not finite"),
+        (np.zeros((5, 3)), np.zeros((5, 3)), r"expected \(F, P, 3\)"),
+        ([[["a"]]], np.zeros((1, 5, 3)), "S cannot be read"),
         (np.zeros((1, 5, 3)), np.ones((1, 5, 3)), "all equal"),
     ],
 )
@@ -128,6 +182,15 @@ def test_cumulative_error_counts(rng):
     for a, s in zip(at[::40], share[::40], strict=True):
         assert s == np.mean(errors <= a)
     assert metrics.cumulative_error(errors, [0.5])[1] == np.mean(errors <= 0.5)
+
+
+def test_frames_without_an_error_do_not_count():
+    at, share = metrics.cumulative_error([0.1, np.nan, 0.4, 0.2])
+    assert at[-1] == 0.4 and share[-1] == 1 and np.isfinite(at).all()
+    assert metrics.cumulative_error([0.1, np.nan, 0.4, np.nan], [0.2])[1] == 0.5
+    for wrong, message in [([np.nan], "holds no number"), ([[0.1, 0.2]], r"shape \(1, 2\)"), (["a"], "cannot be read")]:
+        with pytest.raises(ValueError, match=message):
+            metrics.cumulative_error(wrong)
 
 
 def test_camera_frame_error_forgives_the_sign_of_depth_and_nothing_else(rng):

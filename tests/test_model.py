@@ -1,6 +1,7 @@
 """The network against its equations written out, and what it promises of its output."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -106,8 +107,8 @@ def kronecker_form(net, X):
 
 
 def package_form(net, X):
-    psi, M = net.bottleneck(net.encode(X))
-    return net.decode(psi), M
+    _, S, M = net.lift(X)
+    return S, M
 
 
 @pytest.mark.parametrize(("dtype", "rtol"), [(torch.float, 1e-5), (torch.double, 1e-10)])
@@ -148,7 +149,7 @@ def test_output_is_orthonormal_centred_and_reprojects_best(net, W):
 def test_result_comes_back_in_the_users_units(W, projection):
     net = nl.DeepNRSfM(nl.Config(5, 3, 9, 3, projection=projection)).double()
     S, M, t = net(W)
-    net.scale *= 50
+    net.normalizer = replace(net.normalizer, scale=50.0)
     shift = torch.tensor([320.0, 240.0], dtype=torch.double)
     S2, M2, t2 = net(50 * W + shift)
     torch.testing.assert_close((S2, M2, t2), (50 * S, M, 50 * t + shift))
@@ -186,8 +187,8 @@ def test_to_arrays_and_back(net, W):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"n_points": 2}, "n_points is 2"),
-        ({"n_points": 5, "n_dictionaries": 0}, "n_dictionaries is 0"),
+        ({"n_points": 2}, "n_points=2; expected a whole number, at least 3"),
+        ({"n_points": 5, "n_dictionaries": 0}, "n_dictionaries=0"),
         ({"n_points": 5, "first_atoms": 4, "last_atoms": 8}, "first_atoms=4"),
         ({"n_points": 5, "beta": "none"}, "beta='none'"),
         ({"n_points": 5, "threshold": "hard"}, "threshold='hard'"),
@@ -206,10 +207,10 @@ def test_a_network_needs_its_number_of_points():
 
 def test_names_and_shapes_of_the_weights_are_stable():
     """Files saved today must load tomorrow."""
-    shapes = {k: tuple(v.shape) for k, v in nl.DeepNRSfM(nl.Config(5, 3, 8, 4)).state_dict().items()}
+    shapes = {k: v.shape for k, v in nl.DeepNRSfM(nl.Config(5, 3, 8, 4)).to_arrays()[1].items()}
     assert shapes == {
-        "beta": (24, 4), "gamma": (4,), "output_bias": (5, 3), "scale": (), "image_covariance": (5, 5), "origin": (2,),
-        "prior_mean": (9, 5, 3), "prior_covariance": (9, 15, 15), "prior_noise": (9,),
+        "beta": (24, 4), "gamma": (4,), "output_bias": (5, 3),
+        "normalizer/scale": (), "normalizer/covariance": (5, 5), "normalizer/origin": (2,),
         "D.0": (8, 5, 3), "D.1": (8, 6), "D.2": (6, 4),
         "encoder_threshold.0": (8,), "encoder_threshold.1": (6,), "encoder_threshold.2": (4,),
         "decoder_threshold.0": (8,), "decoder_threshold.1": (6,),
@@ -241,7 +242,7 @@ def test_a_hidden_point_does_not_matter_and_a_weight_of_zero_hides(net, W):
 
 
 def test_save_and_load(net, W, tmp_path):
-    net.scale.fill_(2.0)
+    net.normalizer = replace(net.normalizer, scale=2.0)
     again = nl.DeepNRSfM.load(net.save(tmp_path / "net.pt"))
     assert again.config == net.config and not again.training
     for a, b in zip(again(W), net(W), strict=True):
@@ -252,9 +253,10 @@ def test_what_is_not_a_network_is_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such file"):
         nl.DeepNRSfM.load(tmp_path / "none.pt")
     (tmp_path / "text.pt").write_text("hello")
-    torch.save({"config": {"n_points": 5}, "weights": {}}, tmp_path / "empty.pt")
-    for name in ("text.pt", "empty.pt"):
-        with pytest.raises(ValueError, match="not a saved network"):
+    torch.save({"config": {"n_points": 5}, "weights": {}}, tmp_path / "other.pt")
+    torch.save({"config": {"n_points": 5}, "arrays": {}}, tmp_path / "empty.pt")
+    for name, words in [("text.pt", "not a saved"), ("other.pt", "not a saved"), ("empty.pt", "is incomplete")]:
+        with pytest.raises(ValueError, match=f"{name}: .*{words}"):
             nl.DeepNRSfM.load(tmp_path / name)
 
 
@@ -264,7 +266,7 @@ def test_onnx_is_the_same_function_for_any_number_of_frames(settings, tmp_path):
     onnxruntime = pytest.importorskip("onnxruntime")
     g = torch.Generator().manual_seed(0)
     net = nl.DeepNRSfM(nl.Config(5, 3, 12, 4, **settings), generator=g)
-    net.scale.fill_(3.0)
+    net.normalizer = replace(net.normalizer, scale=3.0)
     session = onnxruntime.InferenceSession(str(net.to_onnx(tmp_path / "net.onnx")))
     for frames in (1, 7):
         W = 10 * torch.randn(frames, 5, 2, generator=g) + 100
@@ -274,3 +276,55 @@ def test_onnx_is_the_same_function_for_any_number_of_frames(settings, tmp_path):
         with torch.no_grad():
             for a, b in zip(got, net(W, visible), strict=True):
                 np.testing.assert_allclose(a, b.numpy(), rtol=1e-4, atol=1e-4)
+
+
+def test_any_kind_of_array_goes_in_and_its_own_type_comes_out(W):
+    net = nl.DeepNRSfM(nl.Config(5, 3, 12, 4), generator=torch.Generator().manual_seed(0))  # float32 inside
+    expected = net(W)
+    assert {x.dtype for x in expected} == {torch.double} and {x.dtype for x in net(W.float())} == {torch.float}
+    visible = np.ones((6, 5), int)
+    for other in (net(W.numpy()), net(W.tolist()), net(W, torch.ones(6, 5)), net(W.numpy(), visible)):
+        for a, b in zip(other, expected, strict=True):
+            torch.testing.assert_close(a.double(), b, rtol=1e-5, atol=1e-5)
+    assert net((100 * W).long())[0].shape == (6, 5, 3)
+
+
+def test_what_the_network_cannot_take_is_said(net, W):
+    with pytest.raises(ValueError, match=r"W has shape \(6, 4, 2\); expected \(B, 5, 2\), as the network has 5 points"):
+        net(W[:, :4])
+    with pytest.raises(ValueError, match=r"W has shape \(5, 2\)"):
+        net(W[0])
+    with pytest.raises(ValueError, match=r"visible has shape \(6, 4\); expected \(6, 5\)"):
+        net(W, torch.ones(6, 4))
+    with pytest.raises(ValueError, match="visible points that are NaN"):
+        net(torch.full_like(W, torch.nan))
+
+
+def test_only_the_part_of_a_prior_that_is_in_use_is_kept(tmp_path):
+    net = nl.DeepNRSfM(n_points=300)
+    assert not [key for key in net.to_arrays()[1] if "prior" in key]
+    small = net.save(tmp_path / "net.pt").stat().st_size
+    assert small < 4 * sum(p.numel() for p in net.parameters()) + 8 * 300**2 + 50_000
+    views = nl.datasets.make_views(nl.datasets.make_motion(60))
+    fitted = nl.fit(views, steps=2, progress=False)
+    assert len(fitted.prior) == 1
+    again = nl.DeepNRSfM.load(fitted.save(tmp_path / "fitted.pt"))
+    torch.testing.assert_close(again.prior[0].covariance, fitted.prior[0].covariance, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("missing", ["normalizer/scale", "D.0", "prior/0/mean"])
+def test_an_incomplete_network_is_refused(missing, tmp_path):
+    net = nl.fit(nl.datasets.make_views(nl.datasets.make_motion(60)), steps=1, progress=False)
+    config, arrays = net.to_arrays()
+    del arrays[missing]
+    with pytest.raises(ValueError, match="incomplete or of another version"):
+        nl.DeepNRSfM.from_arrays(config, arrays)
+
+
+def test_settings_are_not_cut():
+    for wrong in (31.7, "31", True, None):
+        with pytest.raises(ValueError, match="n_points="):
+            nl.Config(wrong)
+    assert nl.Config(31.0).n_points == 31
+    with pytest.raises(ValueError, match="translation='no'; expected True or False"):
+        nl.Config(31, translation="no")

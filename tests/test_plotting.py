@@ -3,6 +3,7 @@
 import re
 
 import matplotlib
+import matplotlib.figure
 import numpy as np
 import pytest
 
@@ -69,6 +70,28 @@ def test_show3d_refuses(motion):
         nl.plotting.show3d(motion.points3d[..., :2])
 
 
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"truth": lambda m: m[:40]}, r"truth has shape \(40, 31, 3\); expected that of shapes, \(90, 31, 3\)"),
+        ({"edges": lambda m: [(0, 31)]}, "edges refers to a point outside 0 … 30"),
+        ({"edges": lambda m: [(0, 0.5)]}, "edges cannot be read as an array of whole numbers"),
+        ({"edges": lambda m: [0, 1, 2]}, r"expected \(E, 2\)"),
+        ({"up": lambda m: (0, 0, 0)}, "expected a direction"),
+        ({"up": lambda m: (0, 1)}, "expected a direction"),
+        ({"max_frames": lambda m: 0}, "max_frames=0"),
+        (
+            {"shapes": lambda m: np.where(m.points3d > 1, np.nan, m.points3d)},
+            "shapes has .* values that are not finite",
+        ),
+        ({"shapes": lambda m: m[:0]}, "at least one frame"),
+    ],
+)
+def test_show3d_refuses_what_it_cannot_draw(motion, more, message):
+    with pytest.raises(ValueError, match=message):
+        nl.plotting.show3d(**{"shapes": motion} | {key: make(motion) for key, make in more.items()})
+
+
 def test_show2d_draws_what_is_visible(motion):
     views = nl.datasets.make_views(motion, missing=5)
     figure = nl.plotting.show2d(views, columns=3)
@@ -83,6 +106,66 @@ def test_pictures_of_few_frames_and_hidden_points(motion):
     rec = nl.Reconstruction(views.points3d, views.cameras)
     figure = nl.plotting.compare(rec, views, columns=2)
     assert np.isfinite(figure.axes[0].lines[1].get_xdata()).sum() == views.visible[0].sum()
+
+
+def test_a_hidden_point_with_coordinates_is_not_drawn_as_seen(motion):
+    views = nl.datasets.make_views(motion)
+    views.visible[:, 3] = False
+    far = views.points2d.copy()
+    far[:, 3] = 1000
+    views.points2d = far
+    rec = nl.Reconstruction(views.points3d, views.cameras)
+    for figure in (nl.plotting.compare(rec, views, columns=2), nl.plotting.show2d(views, columns=2)):
+        lines, dots = figure.axes[0].lines
+        assert np.isnan(dots.get_xdata()).nonzero()[0].tolist() == [3]
+        assert np.nanmax(lines.get_xdata()) < 100 and figure.axes[0].get_xlim()[1] < 100
+    middle = np.nanmean(figure.axes[0].lines[1].get_xdata())
+    np.testing.assert_allclose(np.mean(figure.axes[0].get_xlim()), middle)
+
+
+@pytest.mark.parametrize(
+    ("truth", "more", "message"),
+    [
+        (lambda v: v[:40], {}, r"truth has points3d of shape \(40, 31, 3\); expected that of rec, \(90, 31, 3\)"),
+        (lambda v: nl.Landmarks(points3d=v.points3d), {}, "points2d and points3d"),
+        (lambda v: nl.Landmarks(v.points2d), {}, "points2d and points3d"),
+        (lambda v: v.points3d, {}, "truth must be Landmarks"),
+        (lambda v: v, {"frames": [90]}, "frames=.*from 0 to 89"),
+        (lambda v: v, {"frames": [-1]}, "frames="),
+        (lambda v: v, {"frames": [0.5]}, "frames cannot be read"),
+        (lambda v: v, {"frames": []}, "frames="),
+        (lambda v: v, {"columns": 0}, "columns=0"),
+    ],
+)
+def test_compare_refuses(motion, truth, more, message):
+    views = nl.datasets.make_views(motion)
+    rec = nl.Reconstruction(views.points3d, views.cameras)
+    with pytest.raises(ValueError, match=message):
+        nl.plotting.compare(rec, truth(views), **more)
+    with pytest.raises(ValueError, match="expected a Reconstruction"):
+        nl.plotting.compare(views.points3d, views)
+
+
+def test_show2d_and_draw2d_refuse(motion):
+    views = nl.datasets.make_views(motion)
+    for more, message in [
+        ({"frames": [90]}, "frames="),
+        ({"edges": [(0, 40)]}, "outside"),
+        ({"columns": 1.5}, "columns="),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            nl.plotting.show2d(views, **more)
+    with pytest.raises(ValueError, match="no points2d; photograph them"):
+        nl.plotting.show2d(motion)
+    axis = matplotlib.figure.Figure().subplots()
+    for points, edges, message in [(np.eye(3), [], r"points has shape \(3, 3\)"), (np.eye(3, 2), [(0, 3)], "outside")]:
+        with pytest.raises(ValueError, match=message):
+            nl.plotting.draw2d(axis, points, edges, "k")
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_point_is_a_picture():
+    nl.plotting.show2d(np.ones((2, 1, 2)))
 
 
 def test_an_exported_scene_is_one_page_that_asks_nobody(motion, tmp_path):

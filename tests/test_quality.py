@@ -28,7 +28,7 @@ def nets(views):
 def test_scores_are_finite_and_the_image_error_falls(nets, views):
     first, middle, last = (nl.quality.scores(net, views) for net in nets)
     assert all(np.isfinite(v) for v in last.values())
-    assert np.isnan(first["surprise"])  # no prior yet
+    assert np.isnan(first["negative_log_likelihood"])  # no prior yet
     assert last["image_error"] < middle["image_error"] < first["image_error"]
     assert 0 <= last["coherence"] <= 1 and 0 <= last["distortion"] <= 1
     assert 1 <= last["code_dimension"] <= nets[-1].config.last_atoms
@@ -51,12 +51,12 @@ def test_consistency_needs_a_network_that_answers_alike(nets, views):
     assert nl.quality.consistency(nets[-1], views, seed=0) == nl.quality.consistency(nets[-1], views, seed=0)
 
 
-def test_a_prior_is_less_surprised_by_images_like_its_own(nets, views):
+def test_images_like_its_own_are_likelier_under_a_prior(nets, views):
     strange = views.points2d[:, ::-1].copy()  # the points in another order
-    assert nl.quality.surprise(nets[-1], views) < nl.quality.surprise(nets[-1], strange)
+    assert nl.quality.negative_log_likelihood(nets[-1], views) < nl.quality.negative_log_likelihood(nets[-1], strange)
     hidden = np.ones(strange.shape[:2], bool)
     hidden[:, 5] = False
-    assert np.isfinite(nl.quality.surprise(nets[-1], views.points2d, hidden))
+    assert np.isfinite(nl.quality.negative_log_likelihood(nets[-1], views.points2d, hidden))
 
 
 def test_the_best_of_several_networks(nets, views):

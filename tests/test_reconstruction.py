@@ -1,6 +1,7 @@
 """The front door: from points to a Reconstruction, and back to the points."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def test_keeps_its_promises(views, rec):
 def test_units_of_the_user(views):
     pixels = 200 * views.points2d + (640, 360)
     few, other = (nl.reconstruct(W, steps=5, refine=False, progress=False) for W in (views, pixels))
-    np.testing.assert_allclose(other.shapes, 200 * few.shapes, rtol=0.05, atol=0.5)
+    np.testing.assert_allclose(other.shapes, 200 * few.shapes, rtol=0, atol=0.02)
     np.testing.assert_allclose(other.translations, [[640, 360]] * 600, atol=1e-6)
 
 
@@ -108,7 +109,7 @@ def test_tensors_and_hidden_points(views, rec):
 def test_weak_perspective_scale_goes_into_the_shape(views):
     rec = nl.reconstruct(views, projection="weak_perspective", steps=50, progress=False)
     scale = np.random.default_rng(0).uniform(0.1, 9, (600, 1, 1))
-    other = nl.reconstruct(views.points2d * scale, model=rec.model, projection="weak_perspective")
+    other = nl.reconstruct(views.points2d * scale, model=rec.model)  # the model knows its projection
     np.testing.assert_allclose(other.cameras, rec.cameras, atol=1e-3)
     np.testing.assert_allclose(other.shapes / scale, rec.shapes, atol=1e-3)
 
@@ -123,8 +124,8 @@ def test_projections_come_back_in_the_users_image_whatever_its_size_and_offset(v
     W = size * views.points2d + offset
     model = copy.deepcopy(unit.model)
     if projection == "orthographic":
-        model.scale *= size  # as training on W leaves it
-    rec = nl.reconstruct(W, visible, model=model, projection=projection)
+        model.normalizer = replace(model.normalizer, scale=size * model.normalizer.scale)  # as training on W leaves it
+    rec = nl.reconstruct(W, visible, model=model)
     misses = [np.linalg.norm((r.projections - w)[visible]) for r, w in ((unit, views.points2d), (rec, W))]
     assert misses[1] / size == pytest.approx(misses[0], rel=1e-3)
     residual = np.where(visible[..., None], rec.projections - W, 0.0)
@@ -193,3 +194,50 @@ def test_wrong_input_is_refused(views, rec):
         nl.reconstruct(views.points2d[:, :30], model=rec.model)
     with pytest.raises(ValueError, match="projection='orthographic', not 'weak_perspective'"):
         nl.reconstruct(views, model=rec.model, projection="weak_perspective")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"steps": -5}, "steps=-5 with a trained model"),
+        ({"checkpoint": "nowhere/state.pt"}, "checkpoint=.* with a trained model"),
+        ({"device": "nonsense"}, "device='nonsense' with a trained model"),
+        ({"translation": True}, "trained for translation=False, not True"),
+        ({"adapt": True, "refine": False}, "adapt=True with refine=False"),
+        ({"adapt": True, "refine": "code"}, "adapt=True with refine='code'"),
+        ({"adapt": "yes"}, "adapt='yes'; expected True or False"),
+        ({"refine": 1}, "refine=1"),
+        ({"seed": -1}, "seed=-1"),
+        ({"seed": 0.5}, "seed=0.5"),
+    ],
+)
+def test_what_contradicts_or_cannot_act_is_refused(views, rec, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        nl.reconstruct(views, model=rec.model, **wrong)
+
+
+def test_the_same_is_refused_where_a_network_is_trained(views):
+    for wrong, error, message in [
+        ({"steps": -5}, ValueError, "steps=-5"),
+        ({"steps": 2.9}, ValueError, "steps=2.9"),
+        ({"device": "nonsense"}, ValueError, "no such device here"),
+        ({"checkpoint": "nowhere/state.pt"}, FileNotFoundError, "no such folder"),
+        ({"projection": "fisheye"}, ValueError, "projection='fisheye'"),
+        ({"translation": "no"}, ValueError, "translation='no'"),
+    ]:
+        with pytest.raises(error, match=message):
+            nl.reconstruct(views, progress=False, **wrong)
+    with pytest.raises(ValueError, match="model is a str; expected a DeepNRSfM"):
+        nl.reconstruct(views, model="walk.npz")
+
+
+def test_a_numpy_seed_is_a_seed(views, rec):
+    one, other = (nl.reconstruct(views[:50], model=rec.model, adapt=True, seed=s) for s in (3, np.int64(3)))
+    np.testing.assert_array_equal(one.shapes, other.shapes)
+
+
+def test_refining_shows_its_progress(views, rec, capsys):
+    nl.reconstruct(views, model=rec.model, progress=True)
+    assert "refining" in capsys.readouterr().err
+    nl.reconstruct(views, model=rec.model, progress=False)
+    assert not capsys.readouterr().err

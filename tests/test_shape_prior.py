@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 import nrsfm_lite as nl
-from nrsfm_lite import shape_prior
+from nrsfm_lite import normalizer, shape_prior
 
 P = 6
 
@@ -50,26 +50,26 @@ def turned_by(M, vectors):
 @pytest.mark.parametrize(
     "weight", [[1, 1, 1, 1, 1, 1], [1, 0, 1, 1, 1, 1], [0, 1, 1, 0.3, 1, 1], [1, 1, 0.7, 1, 0.1, 1]]
 )
-def test_a_shape_is_the_conditional_mean_and_turns_end_at_the_most_likely_camera(truth, weight):
+def test_a_shape_is_the_conditional_mean_and_newton_steps_end_at_the_most_likely_camera(truth, weight):
     prior, (_, cameras, images) = some_prior(), truth
     weight = np.array(weight, float)
     visible = weight > 0
     shift = 0.0 if (weight == 1).all() else 1.0
     X, M = images[:1] * torch.as_tensor(visible)[:, None], cameras[:1]
-    seen = torch.as_tensor(np.tile(weight, 2))[None].sqrt()
+    root_weight = torch.as_tensor(np.tile(weight, 2))[None].sqrt()
     for _ in range(60):
-        M = shape_prior._turn(prior, shape_prior._look(prior, X, seen, M), M)
+        M = shape_prior._newton_step(prior, shape_prior._posterior(prior, X, root_weight, M), M)
     np.testing.assert_allclose(M.mT @ M, np.eye(2)[None], atol=1e-12)
     A, C, w, expected = by_hand(prior, X[0], weight, M[0], shift)
     mean = prior.mean.numpy().T.ravel() + prior.covariance.numpy() @ A.T @ np.linalg.solve(C, w - expected)
-    S = shape_prior._look(prior, X, seen, M).shapes[0]
+    S = shape_prior._posterior(prior, X, root_weight, M).shapes[0]
     np.testing.assert_allclose(S.numpy().T.ravel(), mean, atol=1e-8)
 
     def misfit(vector):
         _, C, w, expected = by_hand(prior, X[0], weight, turned_by(M, vector[None])[0], shift)
         return -multivariate_normal(expected, C).logpdf(w)
 
-    got = shape_prior.surprise((prior,), X, torch.as_tensor(weight)[None], M)
+    got = shape_prior.negative_log_likelihood((prior,), X, torch.as_tensor(weight)[None], M)
     assert got == pytest.approx(misfit(np.zeros(3)) / (2 * visible.sum()), rel=1e-9)
     for axis in np.eye(3) * 1e-4:
         slope, bend = misfit(axis) - misfit(-axis), misfit(axis) + misfit(-axis) - 2 * misfit(0 * axis)
@@ -104,14 +104,14 @@ def test_the_noise_of_a_body_is_measured():
     views = nl.datasets.make_views(nl.datasets.make_motion(1000, seed=3), seed=3)
     W = views.points2d + 0.05 * views.points2d.std() * rng.normal(size=views.points2d.shape)
     net = nl.fit(W, steps=300, progress=False)
-    assert net.prior[0].noise ** 0.5 == pytest.approx(0.05 * views.points2d.std() / net.scale.item(), rel=0.3)
+    assert net.prior[0].noise ** 0.5 == pytest.approx(0.05 * views.points2d.std() / net.normalizer.scale, rel=0.3)
 
 
 def test_hidden_points_are_filled_in(truth):
     shapes, cameras, images = truth
     visible = torch.rand(len(images), P, generator=torch.Generator().manual_seed(0)) > 0.2
     visible[:, :2] = True
-    X, _ = nl.preprocessing.center(images, visible)
+    X, _ = normalizer.center(images, visible)
     prior = shape_prior.learn(X, visible, shapes.mean(0).expand_as(shapes), cameras)
     S, _ = shape_prior.apply(prior, X, visible, cameras)
     S = S - S.mean(1, keepdim=True)

@@ -133,8 +133,8 @@ def test_block_threshold_keeps_the_direction_and_takes_one_threshold_per_block()
 def test_gradients_pass_through():
     D, x, lam = lasso(4, 6, seed=1, problems=2)
     D.requires_grad_()
-    assert gradcheck(lambda D: sc.ista(D, x, lam, steps=5, step=0.05), (D,))
-    assert gradcheck(lambda D: sc.fista(D, x, lam, steps=5, step=0.05), (D,))
+    assert gradcheck(lambda D: sc.ista(D, x, lam, steps=5, step_size=0.05), (D,))
+    assert gradcheck(lambda D: sc.fista(D, x, lam, steps=5, step_size=0.05), (D,))
     zero = torch.zeros(2, 3, 2, requires_grad=True)
     sc.block_soft_threshold(zero, 0.5).sum().backward()
     assert torch.isfinite(zero.grad).all()
@@ -210,6 +210,7 @@ def test_coherence_and_babel_against_every_pair(rng):
 def test_coherence_of_special_dictionaries():
     assert sc.mutual_coherence(np.eye(4)) == 0
     assert sc.mutual_coherence(np.array([[1.0, -2.0], [1.0, -2.0]])) == pytest.approx(1)
+    assert sc.mutual_coherence(np.eye(3, dtype=int)) == 0, "whole numbers are numbers"
     assert sc.mutual_coherence(np.array([[1.0, 0.0], [0.0, 0.0]])) == 0, "a column of zeros is orthogonal to all"
 
 
@@ -223,7 +224,17 @@ def test_coherence_of_special_dictionaries():
         (lambda: sc.block_ista(draw(3, 6, 3), draw(2, 6, 2), 0.1, torch.ones(2, 5) > 0), "visible has shape"),
         (lambda: sc.hierarchical_code([draw(4, 6)], draw(4), [0.1, 0.2]), "1 dictionaries, but 2 thresholds"),
         (lambda: sc.mutual_coherence(np.ones((3, 1))), "K >= 2"),
-        (lambda: sc.babel(np.eye(3), 3), "expected 1 … 2"),
+        (lambda: sc.babel(np.eye(3), 3), "1 … 2"),
+        (lambda: sc.babel(np.eye(3), 1.5), "m=1.5"),
+        (lambda: sc.soft_threshold(draw(3), np.nan), "negative or NaN"),
+        (lambda: sc.block_soft_threshold(draw(3, 2), 0.1), r"expected \(\.\.\., K, a, b\)"),
+        (lambda: sc.lipschitz(draw(3)), r"D has shape \(3,\)"),
+        (lambda: sc.ista(draw(4, 6), draw(4), 0.1, steps=2.5), "steps=2.5"),
+        (lambda: sc.ista(draw(4, 6), draw(4), 0.1, step_size=0.0), "step_size=0.0"),
+        (lambda: sc.fista(draw(4, 6), draw(4), 0.1, tol=-1), "tol=-1"),
+        (lambda: sc.hierarchical_code([draw(4, 6)], draw(4), [0.1], steps=-1), "steps=-1"),
+        (lambda: sc.block_ista(draw(3, 6, 3), torch.nan * draw(2, 6, 2), 0.1), "mark missing points as False"),
+        (lambda: sc.block_ista(draw(3, 6, 3), draw(2, 6, 2), 0.1, draw(2, 6)), "visible has values of type"),
     ],
 )
 def test_wrong_input_is_refused(call, message):

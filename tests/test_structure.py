@@ -138,8 +138,8 @@ def test_there_is_no_circle():
 @pytest.mark.parametrize(
     ("code", "heavy"),
     [
-        ("import nrsfm_lite as nl; dir(nl)", "numpy torch scipy matplotlib plotly tqdm psutil"),
-        ("import nrsfm_lite as nl; nl.experiments.NAMES", "numpy torch scipy matplotlib plotly"),
+        ("import nrsfm_lite as nl; dir(nl)", "torch scipy matplotlib plotly tqdm psutil"),
+        ("import nrsfm_lite as nl; nl.experiments.NAMES", "torch scipy matplotlib plotly"),
         ("import nrsfm_lite as nl; nl.reconstruct; nl.baselines", "matplotlib plotly scipy.stats onnx"),
     ],
     ids=["import", "names of experiments", "reconstruct"],

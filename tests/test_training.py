@@ -30,7 +30,7 @@ def reprojection(net, W):
 
 @pytest.mark.parametrize("schedule", ["default", "original"])
 def test_the_loss_falls(views, schedule):
-    few, many = (nl.fit(views.points2d, None, SMALL, schedule, steps=n, progress=False) for n in (1, 300))
+    few, many = (nl.fit(views.points2d, None, SMALL, schedule=schedule, steps=n, progress=False) for n in (1, 300))
     assert reprojection(many, views.points2d) < 0.5 * reprojection(few, views.points2d)
 
 
@@ -44,16 +44,16 @@ def test_same_seed_same_weights_and_no_global_state_touched(views):
 @pytest.mark.parametrize("schedule", ["default", "original"])
 def test_interrupted_training_resumes_to_the_same_result(views, schedule, tmp_path, monkeypatch):
     def train(**more):
-        return nl.fit(views.points2d, None, SMALL, schedule, steps=40, progress=False, **more)
+        return nl.fit(views.points2d, None, SMALL, schedule=schedule, steps=40, progress=False, **more)
 
     whole = train()
     monkeypatch.setattr(training, "_CHECKPOINT_EVERY", 15)
     backpropagate, calls = training.backpropagate, iter(range(25))
 
-    def interrupted(*inputs):
+    def interrupted(*inputs, **more):
         if next(calls, None) is None:
             raise KeyboardInterrupt
-        return backpropagate(*inputs)
+        return backpropagate(*inputs, **more)
 
     monkeypatch.setattr(training, "backpropagate", interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -96,8 +96,8 @@ def test_degenerate_frames_do_not_turn_the_loss_nan():
 def test_a_nonfinite_gradient_costs_a_step_not_the_run(views, monkeypatch):
     backpropagate, calls = training.backpropagate, iter([False] * 5 + [True] + [False] * 20)
 
-    def sometimes_infinite(net, *inputs):
-        loss = backpropagate(net, *inputs)
+    def sometimes_infinite(net, *inputs, **more):
+        loss = backpropagate(net, *inputs, **more)
         if next(calls):
             net.gamma.grad.fill_(torch.inf)
         return loss
@@ -109,7 +109,7 @@ def test_a_nonfinite_gradient_costs_a_step_not_the_run(views, monkeypatch):
 
 @pytest.mark.filterwarnings("ignore:Detected call of")  # the scheduler, before any step was taken
 def test_a_run_that_has_diverged_says_so(views, monkeypatch):
-    def not_a_number(net, *inputs):
+    def not_a_number(net, *inputs, **more):
         net.gamma.grad = torch.full_like(net.gamma, torch.nan)
         return torch.tensor(torch.nan)
 
@@ -175,7 +175,7 @@ def one_place():
         (one_place(), {}, "frame 3 of W has all its visible points at one place"),
         (one_place()[:2], {}, "at least 10 frames and 4 points; got 2 frames of 6 points"),
         (one_place()[:, :3], {}, "got 20 frames of 3 points"),
-        (np.ones((20, 6, 2)), {"config": nl.Config(5)}, "config.n_points is 5"),
+        (np.arange(240.0).reshape(20, 6, 2), {"config": nl.Config(5)}, "config.n_points is 5"),
         (np.ones((20, 6, 2)), {"schedule": "fast"}, "schedule='fast'"),
         (np.ones((20, 6, 2)), {"steps": 0}, "steps=0"),
     ],
@@ -201,3 +201,51 @@ def test_a_schedule_of_ones_own_and_a_look_at_every_step(views):
     net = nl.fit(views, schedule=plan, progress=False, callback=lambda step, net: steps.append((step, net.coherence)))
     assert [s for s, _ in steps] == list(range(1, 8)) and steps[0][1] != steps[-1][1]
     assert net.prior is not None
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"optimizer": "sgd"}, "optimizer='sgd'; expected one of muon, adam"),
+        ({"optimizer": "muon"}, "needs a muon_rate above 0"),
+        ({"optimizer": "adam", "muon_rate": 0.1}, "has no use for muon_rate"),
+        ({"steps": 2.9}, "steps=2.9; expected a whole number, at least 1"),
+        ({"batch": 0}, "batch=0"),
+        ({"rate": 0.0}, "rate=0.0; expected a number above 0"),
+        ({"rate": float("nan")}, "rate=nan"),
+        ({"turn": 1.5}, "turn=1.5; expected a share of the steps"),
+        ({"pull": -1}, "pull=-1"),
+        ({"clip": 0}, "clip=0"),
+    ],
+)
+def test_a_schedule_that_cannot_be_is_refused(wrong, message):
+    fields = {"steps": 10, "batch": 8, "optimizer": "adam", "rate": 1e-3} | wrong
+    with pytest.raises(ValueError, match=message):
+        nl.Schedule(**fields)
+
+
+def test_steps_are_not_cut_and_the_device_must_be_there(views):
+    for wrong, message in [({"steps": 2.9}, "steps=2.9"), ({"device": "nonsense"}, "no such device here")]:
+        with pytest.raises(ValueError, match=message):
+            nl.fit(views, config=SMALL, progress=False, **wrong)
+    with pytest.raises(FileNotFoundError, match="no such folder for the checkpoint"):
+        nl.fit(views, config=SMALL, progress=False, checkpoint="nowhere/state.pt")
+
+
+def test_a_prior_that_cannot_be_learned_does_not_cost_the_training(views, monkeypatch):
+    def fails(*arguments):
+        raise torch.linalg.LinAlgError("not positive definite")
+
+    monkeypatch.setattr(training.shape_prior, "learn", fails)
+    with pytest.warns(UserWarning, match="no shape prior could be learned.*not positive definite"):
+        rec = nl.reconstruct(views, steps=5, progress=False)
+    assert rec.model.prior is None and np.isfinite(rec.shapes).all()
+
+
+@pytest.mark.parametrize("unit", [2.0**10, 2.0**-7, 1000.0, 0.0254])
+def test_the_unit_of_length_does_not_matter(views, unit):
+    W = views.points2d + np.array([3.0, -1.0])
+    one, other = (nl.reconstruct(k * W, steps=30, progress=False) for k in (1.0, unit))
+    exact = unit in (2.0**10, 2.0**-7)
+    for a, b in [(other.shapes / unit, one.shapes), (other.cameras, one.cameras)]:
+        np.testing.assert_allclose(a, b, rtol=0, atol=0 if exact else 1e-4)

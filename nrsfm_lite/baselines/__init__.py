@@ -1,14 +1,17 @@
-"""Classical methods, in one signature: (W or Landmarks, visible=None, **own) -> Reconstruction."""
+"""Classical methods, in one signature: (W or Landmarks, visible=None, *, confidence=None, **own) -> Reconstruction.
 
-from ..completion import complete
-from .bmm import bmm
-from .cns import cns
-from .ksta import ksta
-from .nlo import nlo
-from .pta import pta
-from .rigid import tomasi_kanade
-from .riks import riks
-from .sfc import sfc
-from .sps import sps
+Each method has a private module of its own; what several of them use is in `shared`.
+"""
+
+from ._bmm import bmm
+from ._cns import cns
+from ._ksta import ksta
+from ._nlo import nlo
+from ._pta import pta
+from ._riks import riks
+from ._sfc import sfc
+from ._sps import sps
+from ._tomasi_kanade import tomasi_kanade
+from .shared.completion import complete
 
 __all__ = ["bmm", "cns", "complete", "ksta", "nlo", "pta", "riks", "sfc", "sps", "tomasi_kanade"]

@@ -1,8 +1,14 @@
-"""Data, generated and real; everything comes as `Landmarks`."""
+"""Data, generated and real; everything comes as `Landmarks`.
+
+`load` finds a set by its name; the other loaders take a path, and the makers nothing but a seed.
+"""
 
 from .bvh import CMU_BODY, load_bvh
 from .files import load_classic, load_npz
 from .motion import ACTIONS, make_motion
+from .named import data_folder, load
 from .views import make_views
 
-__all__ = ["ACTIONS", "CMU_BODY", "load_bvh", "load_classic", "load_npz", "make_motion", "make_views"]
+__all__ = [
+    "ACTIONS", "CMU_BODY", "data_folder", "load", "load_bvh", "load_classic", "load_npz", "make_motion", "make_views",
+]  # fmt: skip

@@ -1,22 +1,26 @@
 """Files of landmarks: a user's own key points, and the classic sequences."""
 
+from __future__ import annotations
+
 from pathlib import Path
 
 import numpy as np
 
-from ..data import Landmarks, read_npz
+from ..data import Landmarks, find_npz, read_npz
 
-_KEYS = ("points2d", "visible", "confidence", "points3d", "cameras", "translations", "sequence", "names", "edges")
+_KEYS = (
+    "points2d", "visible", "confidence", "points3d", "cameras", "translations", "sequence", "time", "names", "edges",
+)  # fmt: skip
 
 
-def load_npz(path):
+def load_npz(path: str | Path) -> Landmarks:
     """Landmarks from an .npz file: what `Landmarks.save` wrote, or a user's own arrays.
 
     Parameters
     ----------
     path : path
         Arrays by the names of `Landmarks`; ``W`` may stand for points2d and ``S`` for points3d.
-        Arrays of other names are ignored.
+        Arrays of other names are ignored. The ending .npz may be left out.
 
     Raises
     ------
@@ -26,8 +30,15 @@ def load_npz(path):
         If it has neither points2d nor points3d.
     ValueError
         If it is empty, broken or truncated, or if its arrays do not fit together.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> file = nl.Landmarks(points2d=np.zeros((5, 3, 2)), name="mine").save(tempfile.mkdtemp() + "/mine")
+    >>> nl.datasets.load_npz(file)
+    Landmarks('mine': 5 frames × 3 points; images, all visible)
     """
-    path = Path(path)
+    path = find_npz(path)
     arrays = read_npz(path, keys={*_KEYS, "W", "S", "name"})
     for short, key in [("W", "points2d"), ("S", "points3d")]:
         if short in arrays:
@@ -43,7 +54,7 @@ def load_npz(path):
         raise ValueError(f"{path}: {error}") from None
 
 
-def load_classic(path):
+def load_classic(path: str | Path) -> Landmarks:
     """One of the classic sequences (drink, pickup, yoga, stretch, dance …) as an .npz of arrays.
 
     Parameters
@@ -60,8 +71,16 @@ def load_classic(path):
     ------
     FileNotFoundError, KeyError, ValueError
         As `load_npz`; also if S, S_world and R do not fit together.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> folder = tempfile.mkdtemp()
+    >>> np.savez(folder + "/drink.npz", S=np.eye(4, 3)[None])
+    >>> nl.datasets.load_classic(folder + "/drink")
+    Landmarks('drink': 1 frame × 4 points; images, all visible, 3D truth, true cameras)
     """
-    path = Path(path)
+    path = find_npz(path)
     arrays = read_npz(path, keys={"S", "S_world", "R"})
     if "S" not in arrays:
         raise KeyError(f"{path}: needs an array S (F, P, 3); it is not there.")

@@ -5,10 +5,15 @@ a cycle of key poses. Every passage through the cycle draws new poses around the
 steps are alike, and each sequence has a subject of its own.
 """
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
+from ..checks import whole
 from ..data import Landmarks
 from .skeleton import forward_kinematics, kept_edges
 
@@ -178,7 +183,7 @@ _SEQUENCE = 200  # frames of one subject
 _PER_ACTION = 50  # frames of one action, about
 
 
-def make_motion(n_frames=4000, seed=0, actions=None):
+def make_motion(n_frames: int = 4000, seed: int = 0, *, actions: Sequence[str] | None = None) -> Landmarks:
     """Generated 3D motion of a 31-point body, many subjects and actions; nothing is downloaded.
 
     Parameters
@@ -193,17 +198,22 @@ def make_motion(n_frames=4000, seed=0, actions=None):
 
     Returns
     -------
-    Landmarks with points3d (n_frames, 31, 3) in metres, y up, feet on the floor y = 0.
+    Landmarks with points3d (n_frames, 31, 3) in metres, y up, feet on the floor y = 0, and the time of each frame in
+    seconds from the beginning of its sequence.
 
     Raises
     ------
     ValueError
-        If n_frames is below 1, or actions is a single string.
+        If n_frames is no whole number above 0, if seed is none of at least 0, or if actions is a single string.
     KeyError
         If an action is unknown.
+
+    Examples
+    --------
+    >>> nl.datasets.make_motion(600, actions=["walk", "wave"])
+    Landmarks('motion': 600 frames × 31 points; 3D truth, 3 sequences)
     """
-    if n_frames < 1:
-        raise ValueError(f"n_frames={n_frames}; expected at least 1.")
+    n_frames, seed = whole("n_frames", n_frames, 1), whole("seed", seed, 0)
     if isinstance(actions, str):
         raise ValueError(f"actions={actions!r}; expected a sequence of names.")
     actions = ACTIONS if actions is None else tuple(actions)
@@ -223,6 +233,7 @@ def make_motion(n_frames=4000, seed=0, actions=None):
     return Landmarks(
         points3d=np.concatenate(motions),
         sequence=np.repeat(np.arange(n_sequences), lengths),
+        time=np.concatenate([np.arange(length) / _FPS for length in lengths]),
         names=NAMES,
         edges=kept_edges(_PARENTS, range(len(NAMES))),
         name="motion",

@@ -1,9 +1,13 @@
 """A tree of joints: forward kinematics, and the edges that a drawing needs."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+
 import numpy as np
 
 
-def forward_kinematics(parents, offsets, rotations):
+def forward_kinematics(parents: Sequence[int], offsets: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     """Joint positions of a chain of local rotations, all frames at once.
 
     Parameters
@@ -18,6 +22,12 @@ def forward_kinematics(parents, offsets, rotations):
     Returns
     -------
     (F, J, 3) positions in the world.
+
+    Examples
+    --------
+    >>> nl.datasets.skeleton.forward_kinematics([-1, 0], np.eye(3)[:2], np.eye(3)[None, None].repeat(2, 1))[0]
+    array([[1., 0., 0.],
+           [1., 1., 0.]])
     """
     n_frames, n_joints = rotations.shape[:2]
     offsets = np.broadcast_to(offsets, (n_frames, n_joints, 3))
@@ -32,7 +42,7 @@ def forward_kinematics(parents, offsets, rotations):
     return positions
 
 
-def kept_edges(parents, keep):
+def kept_edges(parents: Sequence[int], keep: Sequence[int]) -> np.ndarray:
     """Edges among the kept joints: each one to its nearest kept ancestor.
 
     Parameters
@@ -43,6 +53,11 @@ def kept_edges(parents, keep):
     Returns
     -------
     (E, 2) int, in the numbering of the kept points.
+
+    Examples
+    --------
+    >>> nl.datasets.skeleton.kept_edges([-1, 0, 1], keep=[0, 2])
+    array([[0, 1]])
     """
     point_of = {joint: point for point, joint in enumerate(keep)}
     edges = []

@@ -1,23 +1,28 @@
 """Photographing a motion: 2D views of 3D landmarks from random cameras."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from .. import checks
 from ..cameras import nearness, project, random_cameras
 from ..data import Landmarks
 
 
 def make_views(
-    data,
-    seed=0,
-    projection="orthographic",
-    missing=0,
-    noise=0.0,
-    scale_range=None,
-    translation_range=None,
-    distance=4.0,
-):
+    data: Landmarks,
+    seed: int = 0,
+    *,
+    projection: str = "orthographic",
+    missing: int | float | str = 0,
+    noise: float = 0.0,
+    scale_range: Sequence[float] | None = None,
+    translation_range: float | None = None,
+    distance: float = 4.0,
+) -> Landmarks:
     """One random view of each frame of a motion, whose shapes are first centred over their points.
 
     Parameters
@@ -51,23 +56,28 @@ def make_views(
     Raises
     ------
     ValueError
-        If `data` has no points3d, or if an argument is out of range.
+        If `data` has no points3d or no frames, or if an argument is out of range.
+
+    Examples
+    --------
+    >>> nl.datasets.make_views(nl.datasets.make_motion(50), missing=0.1, noise=0.05)
+    Landmarks('motion': 50 frames × 31 points; images, 90.3% visible, 3D truth, true cameras)
     """
     if not isinstance(data, Landmarks) or data.points3d is None:
         raise ValueError("make_views needs Landmarks with points3d; got none.")
-    if projection not in ("orthographic", "weak_perspective", "perspective"):
-        raise ValueError(f"projection={projection!r}; expected 'orthographic', 'weak_perspective' or 'perspective'.")
-    if not 1 < distance < np.inf:
-        raise ValueError(f"distance={distance}; expected a number above 1, in sizes of the object.")
+    if not len(data):
+        raise ValueError("make_views needs at least one frame; these landmarks have none.")
+    seed = checks.whole("seed", seed, 0)
+    checks.one_of("projection", projection, ("orthographic", "weak_perspective", "perspective"))
+    distance = checks.at_least("distance", distance, 1, above=True)
     if isinstance(missing, str) and (missing != "self" or not len(data.edges)):
         expected = "a number or 'self'" if missing != "self" else "landmarks with edges, which are what hides points"
         raise ValueError(f"missing={missing!r}; expected {expected}.")
     if scale_range is not None and projection == "orthographic":
         raise ValueError("scale_range has no meaning for orthographic views; use projection='weak_perspective'.")
-    if not 0 <= noise < np.inf:
-        raise ValueError(f"noise={noise}; expected a number of at least 0.")
-    if translation_range is not None and not (np.isscalar(translation_range) and translation_range >= 0):
-        raise ValueError(f"translation_range={translation_range}; expected a number of at least 0.")
+    noise = checks.at_least("noise", noise)
+    if translation_range is not None:
+        translation_range = checks.at_least("translation_range", translation_range)
     n_frames, n_points = data.visible.shape
     # One stream per purpose: asking for noise does not change the cameras.
     cameras_rng, scale_rng, shift_rng, noise_rng, hide_rng = (
@@ -76,9 +86,7 @@ def make_views(
     cameras = random_cameras(n_frames, cameras_rng)
     S = data.points3d - data.points3d.mean(1, keepdims=True)
     if projection == "weak_perspective" or scale_range is not None:
-        low, high = (0.5, 1.5) if scale_range is None else scale_range
-        if not 0 < low <= high:
-            raise ValueError(f"scale_range={scale_range}; expected 0 < low <= high.")
+        low, high = _range("scale_range", (0.5, 1.5) if scale_range is None else scale_range)
         S = S * scale_rng.uniform(low, high, (n_frames, 1, 1))
     translations = np.zeros((n_frames, 2))
     size = np.ptp(S, axis=1).max()
@@ -102,6 +110,14 @@ def make_views(
     )
 
 
+def _range(name, value):
+    """A pair 0 < low <= high of finite numbers."""
+    pair = checks.as_array(name, value, float)
+    if pair.shape != (2,) or not 0 < pair[0] <= pair[1] < np.inf:
+        raise ValueError(f"{name}={value}; expected a pair of numbers, 0 < low <= high.")
+    return pair
+
+
 def _in_sight(S, cameras, edges, radius):
     """(F, P) bool: False where a rod of this radius around some edge is in front of a point."""
     Q = np.concatenate([project(S, cameras), nearness(S, cameras)[..., None]], 2)  # x, y, nearness
@@ -123,7 +139,7 @@ def _hide(rng, missing, n_frames, n_points):
     if isinstance(missing, (bool, np.bool_)) or not isinstance(missing, (int, float, np.number)):
         raise ValueError(f"missing={missing!r}; expected a whole number of points or a share of them.")
     whole = isinstance(missing, (int, np.integer))
-    most = int(missing) if whole else round(missing * n_points)
+    most = int(missing) if whole else round(checks.at_least("missing", missing) * n_points)
     if not 0 <= most < n_points:
         raise ValueError(
             f"missing={missing}; expected to hide at least 0 and at most {n_points - 1} of {n_points} points."

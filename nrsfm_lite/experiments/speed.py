@@ -84,7 +84,7 @@ def _package_step(X, schedule):
     optimizers = make_optimizers(net, SCHEDULES[schedule])
 
     def step():
-        backpropagate(net, X, None, size)
+        backpropagate(net, X, size=size)
         for optimizer in optimizers:
             optimizer.step()
 

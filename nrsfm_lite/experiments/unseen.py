@@ -1,15 +1,15 @@
 """What helps frames that no network has seen: changes of the default training, each alone (chapter 10)."""
 
-import math
+from dataclasses import replace
 
 import torch
 
 from .. import metrics, shape_prior
-from ..cameras import image_turns, nearest_orthonormal, nearness, random_cameras
+from ..cameras import nearest_orthonormal, nearness, random_cameras
+from ..images import parse
 from ..model import Config, DeepNRSfM
-from ..normalizer import set_scale
 from ..threads import use_threads
-from ..training import PRIOR_FRAMES, SCHEDULES, make_optimizers, warmup_cosine
+from ..training import PRIOR_FRAMES, SCHEDULES, Descent, learn_normalizer
 from .lab import scoring
 
 QUESTION = "Which changes of the training, or of the network, help on unseen frames? Would 3D supervision?"
@@ -58,31 +58,24 @@ def report(rows: list[dict[str, str]]) -> str:
 
 
 def _train(views, change, steps, seed):
-    """The loop of `fit`, with one change and a gradient by autograd."""
-    plan = SCHEDULES["default"]
+    """`training.train` with one change and a gradient by autograd."""
+    plan = replace(SCHEDULES["default"], steps=steps, **({"pull": 0.0} if change == _DEPTH else {}))
     random = torch.Generator().manual_seed(seed)
     net = DeepNRSfM(Config(views.n_points), generator=random)
-    W = torch.as_tensor(views.points2d)
-    visible = torch.ones(W.shape[:2], dtype=torch.bool)
-    net.scale.fill_(set_scale(W - W.mean(1, keepdim=True), visible))
-    X = net.normalize(W, visible)[1].float()
-    depth = torch.as_tensor(nearness(views.points3d, views.cameras)).float() / net.scale
-    optimizers = make_optimizers(net, plan)
-    rates = [torch.optim.lr_scheduler.LambdaLR(o, warmup_cosine(steps)) for o in optimizers]
-    for step in range(steps):
-        pick = torch.randint(len(X), (min(plan.batch, len(X)),), generator=random)
-        images = X[pick]
-        if step < plan.turn * steps:
-            images = images @ image_turns(2 * math.pi * torch.rand(len(pick), generator=random))
-        pull = 0 if change == _DEPTH else plan.pull * max(0.0, 1 - 2 * step / steps)
-        loss = _loss(net, images, depth[pick], change, pull, random)
+    images = parse(views.points2d)
+    W, mean, weight = (torch.as_tensor(a) for a in (images.centred, images.mean, images.weight))
+    net.normalizer = learn_normalizer(net.normalizer, W, mean, weight)
+    X = net.normalizer.normalize(W, mean, weight)[1].float()
+    depth = (torch.as_tensor(nearness(views.points3d, views.cameras)) / net.normalizer.scale).float()
+
+    def gradient(pick, turns, pull):
+        shown = X[pick] if turns is None else X[pick] @ turns
+        loss = _loss(net, shown, depth[pick], change, pull, random)
         net.zero_grad()
         loss.backward()
-        if torch.isfinite(torch.nn.utils.clip_grad_norm_(net.parameters(), plan.clip)):
-            for optimizer in optimizers:
-                optimizer.step()
-        for rate in rates:
-            rate.step()
+        return loss.detach()
+
+    Descent(net, plan, random).run(len(X), gradient)
     return net.eval()
 
 
@@ -99,8 +92,7 @@ def _loss(net, images, depth, change, pull, random):
     if change == "noise":
         noise = torch.randn(images.shape, generator=random)
         shown = images + noise * (_NOISE * size / noise.flatten(1).norm(dim=1))[:, None, None]
-    psi, M = _encode(net, shown, change)
-    S = net.decode(psi)
+    _, S, M = _lift(net, shown, change)
     missed = images - S @ M
     if change == _DEPTH:
         third = torch.linalg.cross(M[..., 0], M[..., 1])
@@ -109,18 +101,17 @@ def _loss(net, images, depth, change, pull, random):
     if change == "new views":
         turned = torch.as_tensor(random_cameras(len(S), int(torch.randint(2**31, (), generator=random)))).float()
         target = S.detach()
-        psi, _ = _encode(net, target @ turned, change)
-        again = (net.decode(psi) - target).flatten(1).norm(dim=1) / target.flatten(1).norm(dim=1)
+        again = (_lift(net, target @ turned, change)[1] - target).flatten(1).norm(dim=1) / target.flatten(1).norm(dim=1)
         loss = loss + again.mean() / 2
     if pull:
         loss = loss + pull * ((S - net.output_bias).flatten(1).norm(dim=1) / size).mean()
     return loss
 
 
-def _encode(net, X, change):
-    """Code and camera; with unit dictionaries and further iterations of block ISTA per layer, if asked for."""
+def _lift(net, X, change):
+    """`DeepNRSfM.lift`; with unit dictionaries and further iterations of block ISTA per layer, if asked for."""
     if change not in _ITERATIONS:
-        return net.bottleneck(net.encode(X))
+        return net.lift(X)
     B, P, _ = X.shape
     first, *rest = net.D
     Z = X.mT.reshape(2 * B, P)
@@ -131,7 +122,8 @@ def _encode(net, X, change):
             missed = Z - code.view(len(Z), -1) @ D.mT
             code = torch.relu(code + (missed @ D).view(-1, len(b)) - b)
         Z = code
-    return net.bottleneck(Z.view(B, 2, 3, -1))
+    psi, M = net.bottleneck(Z.view(B, 2, 3, -1))
+    return psi, net.decode(psi), M
 
 
 @torch.no_grad()
@@ -155,8 +147,7 @@ def _guess(nets, change, views):
     X = X.float()
     S_sum, M_sum = 0.0, 0.0
     for net in nets:
-        psi, M = _encode(net, X, change)
-        S = net.decode(psi)
+        _, S, M = _lift(net, X, change)
         S = S - S.mean(1, keepdim=True)
         if net is nets[0]:
             M_first = M

@@ -1,17 +1,23 @@
 """Consensus of non-rigid reconstructions: many small groups of points, then one shape (Lee, Cho & Oh, 2016)."""
 
+from __future__ import annotations
+
 from itertools import chain
 from math import comb
+from typing import Any
 
 import numpy as np
 import torch
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator, eigsh
 
+from ..checks import at_least, whole
+from ..data import Reconstruction
+from ..images import read
 from ..threads import one_thread
-from .images import read
-from .limits import Watch, check_cost, check_whole
-from .weak import weak_depths
+from ._cns_groups import weak_depths
+from .shared.completion import completed
+from .shared.limits import Watch, check_cost
 
 _GROUPS = 32  # at a time: few large operations in place of many small ones
 _BATCH = 2**22  # but no more numbers in one array
@@ -22,7 +28,18 @@ _STEPS = 10_000
 
 
 @one_thread
-def cns(W, visible=None, group_size=10, groups_per_point=50, locality=0.1, max_seconds=None, progress=True, seed=0):
+def cns(
+    W: Any,
+    visible: Any = None,
+    *,
+    confidence: Any = None,
+    group_size: int = 10,
+    groups_per_point: int = 50,
+    locality: float = 0.1,
+    max_seconds: float | None = None,
+    progress: bool = True,
+    seed: int | np.random.Generator = 0,
+) -> Reconstruction:
     """Depths of many small groups of points, each by low rank, and the shape that most of them agree on.
 
     Objective: with the depths z_gf of group g in frame f, up to a translation t_gf, and P_g picking its points,
@@ -45,6 +62,9 @@ def cns(W, visible=None, group_size=10, groups_per_point=50, locality=0.1, max_s
     W : Landmarks, or (F, P, 2) array of image points
     visible : (F, P) bool, optional
         Hidden points are filled in by `complete` first.
+    confidence : (F, P), optional
+        From 0 to 1; `complete` moves a doubtful point towards its likely place. Default: that of the Landmarks,
+        else 1.
     group_size : int
         Points per group, at least 4; with no more points than that, all are a single group, and nothing is left to
         agree on. As this, `groups_per_point` and `locality`, the default is that of the authors' program.
@@ -60,13 +80,13 @@ def cns(W, visible=None, group_size=10, groups_per_point=50, locality=0.1, max_s
 
     Returns
     -------
-    Reconstruction in the frame of the camera: all cameras are (1, 0, 0), (0, 1, 0).
+    Reconstruction in the frame of the camera, in the units of W: all cameras are (1, 0, 0), (0, 1, 0).
 
     Raises
     ------
     ValueError
-        For a parameter out of range, fewer frames than half a group's points, fewer than 4 points, a point hidden
-        in every frame, or if it takes more memory than there is, or more than an hour without `max_seconds`.
+        As `images.read`, with fewer frames than half a group's points or fewer than 4 points; for a parameter out
+        of range; or if it takes more memory than there is, or more than an hour without `max_seconds`.
 
     Notes
     -----
@@ -74,12 +94,22 @@ def cns(W, visible=None, group_size=10, groups_per_point=50, locality=0.1, max_s
     the same result: singular values come from small Gram matrices of centred points, the common signs from Lanczos'
     method in place of the power method, and the consensus starts where its penalty begins to matter. On data
     without noise the cameras of a group, not quite determined, converge so slowly that they are stopped.
+
+    References
+    ----------
+    Lee, Cho, Oh (2016). Consensus of non-rigid reconstructions. CVPR, 4670–4678.
+
+    Examples
+    --------
+    >>> views = nl.datasets.make_views(nl.datasets.make_motion(30))
+    >>> rec = nl.baselines.cns(views, groups_per_point=1, progress=False)
+    >>> rec.shapes.shape == views.points3d.shape
+    True
     """
-    check_whole("group_size", group_size, 4, 1000)
-    check_whole("groups_per_point", groups_per_point, 1, 10_000)
-    if not 0 <= locality < np.inf:
-        raise ValueError(f"locality={locality}; expected 0 or a positive number.")
-    images = read(W, visible, frames=max(3, (group_size + 1) // 2), method="cns")
+    group_size = whole("group_size", group_size, 4, 1000)
+    groups_per_point = whole("groups_per_point", groups_per_point, 1, 10_000)
+    locality = at_least("locality", locality)
+    images = completed(read(W, visible, confidence, method="cns", frames=max(3, (group_size + 1) // 2), points=4))
     F, P, _ = images.X.shape
     watch = Watch("cns", max_seconds, progress)
     n = min(group_size, P)
@@ -92,10 +122,10 @@ def cns(W, visible=None, group_size=10, groups_per_point=50, locality=0.1, max_s
     depths *= group_signs(depths, groups)[:, None, None]
     z = consensus(depths, groups)
     S = np.concatenate([images.X, z.T[..., None]], 2)
-    return images.reconstruction(S, np.tile(np.eye(3, 2), (F, 1, 1)), "cns", finished)
+    return images.reconstruction(S, np.tile(np.eye(3, 2), (F, 1, 1)), method="cns", converged=finished)
 
 
-def sample_groups(X, size, per_point, locality, rng):
+def sample_groups(X: np.ndarray, size: int, per_point: int, locality: float, rng: np.random.Generator) -> np.ndarray:
     """Groups of points that look alike in all frames, no two the same, until every point is in `per_point`.
 
     A group starts with any of the points that are used least. Every further point j is drawn with a probability
@@ -137,13 +167,13 @@ def sample_groups(X, size, per_point, locality, rng):
     return np.nonzero(groups)[1].reshape(-1, size)
 
 
-def _depths(X, groups, watch):
+def _depths(X: np.ndarray, groups: np.ndarray, watch: Watch) -> tuple[np.ndarray, bool]:
     """Depths (m, n, F) of the groups for which there is time, but of enough to cover all points; all done?"""
     F, P, _ = X.shape
     images = torch.as_tensor(X)
     per_batch = max(1, min(_GROUPS, _BATCH // (2 * F * comb(groups.shape[1], 2))))
 
-    def batches(groups):
+    def batches(groups: np.ndarray) -> list[np.ndarray]:
         return [groups[k : k + per_batch] for k in range(0, len(groups), per_batch)]
 
     enough = max((groups == p).any(1).argmax() for p in range(P)) + 1
@@ -156,7 +186,7 @@ def _depths(X, groups, watch):
     return depths, len(depths) == len(groups)
 
 
-def group_signs(depths, groups):
+def group_signs(depths: np.ndarray, groups: np.ndarray) -> np.ndarray:
     """Signs of the groups such that their depths agree where they overlap.
 
     With unit depths z_g and one sequence u of depths for all points, maximises Σ_g ⟨z_g, u⟩² less the variation
@@ -180,10 +210,10 @@ def group_signs(depths, groups):
     count = together.diagonal()  # groups that a point is in
     kept = np.diag(count.max() - count) + together / n  # most groups of a point, less the centring of every group
 
-    def explained(U):
+    def explained(U: np.ndarray) -> np.ndarray:
         return np.einsum("gnf,gnf->g", depths, U.reshape(P, F)[groups])
 
-    def times(U):
+    def times(U: np.ndarray) -> np.ndarray:
         new = picks.T @ (explained(U)[:, None, None] * depths).reshape(m * n, F)
         return (kept @ U.reshape(P, F) + new).ravel()
 
@@ -192,7 +222,7 @@ def group_signs(depths, groups):
     return np.where(explained(U) < 0, -1.0, 1.0)
 
 
-def consensus(depths, groups):
+def consensus(depths: np.ndarray, groups: np.ndarray) -> np.ndarray:
     """The depths of all points on which most groups agree, by least absolute differences.
 
     min ‖y − A x‖₁ for each frame, where x holds the depths of the points and one translation per group, y the depths
@@ -226,7 +256,9 @@ def consensus(depths, groups):
     return z
 
 
-def _least_absolute(A, At, y, x, slope):
+def _least_absolute(
+    A: sparse.csr_array, At: sparse.csr_array, y: np.ndarray, x: np.ndarray, slope: float
+) -> np.ndarray:
     """x that minimises ‖y − A x‖₁ column by column, from the least-squares solution."""
     rest = y - A @ x
     # While the penalty is small, nothing is an outlier, x stays the least-squares solution, and the multipliers L

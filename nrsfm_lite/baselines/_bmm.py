@@ -1,11 +1,19 @@
 """Block matrix method: shapes of least nuclear norm, with no other prior (Dai, Li and He, 2012 and 2014)."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 
+from ..checks import whole
+from ..data import Reconstruction
+from ..images import read
 from ..threads import one_thread
-from .images import read
-from .limits import Watch, check_cost, check_whole, choose_rank
-from .upgrade import unordered_cameras
+from .shared.completion import completed
+from .shared.descent import nesterov
+from .shared.limits import Watch, check_cost, choose_rank
+from .shared.upgrade import unordered_cameras
 
 _LEVELS = 20  # of the weight μ, each a quarter of the one before
 _FIRST, _LAST = 1.0, 1e-10  # its limits, for points of unit scale
@@ -14,7 +22,17 @@ _ITERATIONS = 5000  # at most, per level
 
 
 @one_thread
-def bmm(W, visible=None, rank=None, restarts=10, max_seconds=None, progress=True, seed=0):
+def bmm(
+    W: Any,
+    visible: Any = None,
+    *,
+    confidence: Any = None,
+    rank: int | None = None,
+    restarts: int = 10,
+    max_seconds: float | None = None,
+    progress: bool = True,
+    seed: int = 0,
+) -> Reconstruction:
     """Cameras from a low-rank factorisation; then, of all shapes that fit the images, those of least nuclear norm.
 
     Objective: ``min_S μ‖S♯‖_* + ½ Σ_f ‖X_f − S_f M_f‖²`` for μ → 0, where S♯ (F, 3P) holds a shape per row. Its
@@ -32,12 +50,15 @@ def bmm(W, visible=None, rank=None, restarts=10, max_seconds=None, progress=True
     W : Landmarks, or (F, P, 2) array of image points
     visible : (F, P) bool, optional
         Hidden points are filled in by `complete` first.
+    confidence : (F, P), optional
+        From 0 to 1; `complete` moves a doubtful point towards its likely place. Default: that of the Landmarks,
+        else 1.
     rank : int, optional
         Number of shape atoms K, with 3K at most P and 2F. Dai et al. choose it per sequence, 4 to 12. Default:
         10, or the largest possible.
     restarts : int
-        Random starts of the cameras' upgrade (`upgrade.unordered_cameras`), of which the best is kept; 10 suffice where
-        40 of 60 starts found the same minimum (yoga).
+        Random starts of the cameras' upgrade (`unordered_cameras`), of which the best is kept. Most starts find the
+        same minimum where this was counted (yoga).
     max_seconds : float, optional
         Then the result so far is returned, with ``converged=False``.
     progress : bool
@@ -45,32 +66,45 @@ def bmm(W, visible=None, rank=None, restarts=10, max_seconds=None, progress=True
 
     Returns
     -------
-    Reconstruction in one world frame for all frames.
+    Reconstruction in one world frame for all frames, in the units of W.
 
     Raises
     ------
     ValueError
-        As `images.read`; for a rank out of range; or if memory or time would not suffice.
+        As `images.read`, with fewer than 4 frames or 6 points; for a parameter out of range; or if memory or time
+        would not suffice.
 
     Notes
     -----
     Certain: objective, weights and ranks, from the authors' code. Ours: random starts instead of their
     semidefinite programme, a symmetric form of the cameras' misfit, signs without temporal order, and momentum, which
-    changes the errors on the classic sequences by less than 2 %. Their second method, smoothness in time, is left out.
+    hardly changes the errors on the classic sequences. Their second method, smoothness in time, is left out.
+
+    References
+    ----------
+    Dai, Li, He (2014). A simple prior-free method for non-rigid structure-from-motion factorization. International
+    Journal of Computer Vision 107(2), 101–122.
+
+    Examples
+    --------
+    >>> views = nl.datasets.make_views(nl.datasets.make_motion(30))
+    >>> rec = nl.baselines.bmm(views, rank=3, restarts=1, progress=False)
+    >>> rec.shapes.shape == views.points3d.shape
+    True
     """
-    images = read(W, visible, frames=4, points=6, method="bmm")
+    images = completed(read(W, visible, confidence, method="bmm", frames=4, points=6))
     F, P, _ = images.X.shape
     rank = choose_rank(rank, 10, 2, F, P)
-    check_whole("restarts", restarts, 1, 1000)
+    restarts = whole("restarts", restarts, 1, 1000)
     check_cost("bmm", F, 8 * (80 * F * P + 5 * (3 * P) ** 2) / 2**30, 3.5e-6 * F * P**2 + 2e-6 * P**3, max_seconds)
     watch = Watch("bmm", max_seconds, progress)
     rng = np.random.default_rng(seed)
     M = unordered_cameras(images.X, rank, watch.steps(restarts, "cameras"), rng)
     S, converged = _least_nuclear_norm(images.X, M, rank, watch)
-    return images.reconstruction(S, M, "bmm", converged)
+    return images.reconstruction(S, M, method="bmm", converged=converged)
 
 
-def _least_nuclear_norm(X, M, rank, watch):
+def _least_nuclear_norm(X: np.ndarray, M: np.ndarray, rank: int, watch: Watch) -> tuple[np.ndarray, bool]:
     """Shapes (F, P, 3) for given cameras, and whether all levels were gone through."""
     F, P, _ = X.shape
     A = _cut((X @ M.swapaxes(1, 2)).reshape(F, 3 * P), rank)
@@ -84,16 +118,15 @@ def _least_nuclear_norm(X, M, rank, watch):
             change = np.linalg.norm(new - A) / max(1, np.linalg.norm(A))
             if ((ahead - new) * (new - A)).sum() > 0:  # the momentum points uphill: start it anew
                 momentum = 1.0
-            following = (1 + np.sqrt(1 + 4 * momentum**2)) / 2
-            ahead = new + (momentum - 1) / following * (new - A)
-            A, momentum = new, following
+            momentum, share = nesterov(momentum)
+            ahead, A = new + share * (new - A), new
             if change < _TOLERANCE or watch.over:
                 break
         levels += change < _TOLERANCE
     return _cut(A, rank).reshape(F, P, 3), levels == _LEVELS
 
 
-def _shrink(A, threshold):
+def _shrink(A: np.ndarray, threshold: float) -> np.ndarray:
     """All singular values of A (F, n) smaller by the threshold, at least 0; from the Gram matrix, for F ≫ n."""
     values, V = np.linalg.eigh(A.T @ A)
     size = np.sqrt(np.maximum(values, 0))
@@ -102,7 +135,7 @@ def _shrink(A, threshold):
     return (A @ (V * (1 - threshold / size[kept]))) @ V.T
 
 
-def _cut(A, rank):
+def _cut(A: np.ndarray, rank: int) -> np.ndarray:
     """The nearest matrix of that rank."""
     V = np.linalg.eigh(A.T @ A)[1][:, -rank:]
     return A @ V @ V.T

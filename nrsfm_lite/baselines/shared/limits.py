@@ -1,11 +1,18 @@
 """Progress, the time a user grants, and a refusal before a machine is brought down."""
 
-import time
-from pathlib import Path
+from __future__ import annotations
 
-import numpy as np
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
 import psutil
 from tqdm import tqdm
+
+from ... import checks
+
+Thing = TypeVar("Thing")
 
 _SHARE = 0.8  # of the free memory that a method may take
 LONG = 3600  # seconds that nobody is made to wait unasked
@@ -25,18 +32,18 @@ class Watch:
     progress : bool
     """
 
-    def __init__(self, method, max_seconds=None, progress=True):
-        if max_seconds is not None and not max_seconds > 0:
-            raise ValueError(f"max_seconds={max_seconds}; expected a positive number of seconds, or None.")
-        self.method, self.progress = method, progress
+    def __init__(self, method: str, max_seconds: float | None = None, progress: bool = True) -> None:
+        if max_seconds is not None:
+            checks.at_least("max_seconds", max_seconds, above=True)
+        self.method, self.progress = method, checks.truth("progress", progress)
         self.end = None if max_seconds is None else time.monotonic() + max_seconds
 
     @property
-    def over(self):
+    def over(self) -> bool:
         """True once the time is up."""
         return self.end is not None and time.monotonic() > self.end
 
-    def steps(self, things, what):
+    def steps(self, things: Iterable[Thing] | int, what: str) -> Iterator[Thing | int]:
         """The items of `things` (or of range(things)) until they or the time are over; the first one always."""
         things = range(things) if isinstance(things, int) else things
         bar = tqdm(things, desc=f"{self.method}: {what}", disable=not self.progress, leave=False)
@@ -47,7 +54,14 @@ class Watch:
                 return
 
 
-def check_cost(method, frames, gigabytes, seconds=0, max_seconds=None, advice=""):
+def check_cost(
+    method: str,
+    frames: int,
+    gigabytes: float,
+    seconds: float = 0,
+    max_seconds: float | None = None,
+    advice: str = "",
+) -> None:
     """Refuse what this machine cannot do, or not within an hour unless a limit is given.
 
     Parameters
@@ -76,27 +90,21 @@ def check_cost(method, frames, gigabytes, seconds=0, max_seconds=None, advice=""
         )
 
 
-def check_whole(name, value, least, most, circumstance=""):
-    """Raise ValueError unless a parameter is a whole number from `least` to `most`."""
-    if not (isinstance(value, (int, np.integer)) and least <= value <= most):
-        raise ValueError(f"{name}={value}; expected a whole number, {least} … {most}{circumstance}.")
-
-
-def choose_rank(rank, usual, least, frames, points):
+def choose_rank(rank: Any, usual: int, least: int, frames: int, points: int) -> int:
     """The user's rank, checked, or the usual one; three components per atom fit into `points` and 2 · `frames`."""
     most = min(points, 2 * frames) // 3
     rank = min(usual, most) if rank is None else rank
-    check_whole("rank", rank, least, most, f" for {frames} frames and {points} points")
-    return rank
+    return checks.whole("rank", rank, least, most, f" for {frames} frames and {points} points")
 
 
-def check_share(name, value):
-    """Raise ValueError unless a parameter is a share of the frames."""
-    if not 0 < value <= 1:
-        raise ValueError(f"{name}={value}; expected a share of the frames, above 0 and at most 1.")
+def choose_components(name: str, share: Any, rank: int, frames: int) -> int:
+    """How many basis functions of the frames a share of them is; at least the rank."""
+    if checks.at_least(name, share, above=True) > 1:
+        raise ValueError(f"{name}={share!r}; expected a share of the frames, above 0 and at most 1.")
+    return max(rank, round(share * frames))
 
 
-def _free_bytes():
+def _free_bytes() -> float:
     """Memory that is free, inside a container also by its own limit."""
     free = psutil.virtual_memory().available
     try:

@@ -1,20 +1,37 @@
 """Rotation invariant kernels: frames that look alike have alike shapes (Hamsici, Gotardo and Martinez, 2012)."""
 
+from __future__ import annotations
+
+from typing import Any
+
 import numpy as np
 import torch
 
+from ..checks import one_of
+from ..data import Reconstruction
+from ..images import read
 from ..threads import one_thread
-from .images import read, stacked
-from .limits import Watch, check_cost, check_share, choose_rank
-from .upgrade import trajectory_cameras
-from .variable_projection import fit, linear
+from .shared.completion import completed
+from .shared.limits import Watch, check_cost, choose_components, choose_rank
+from .shared.upgrade import stacked, trajectory_cameras
+from .shared.variable_projection import fit, linear
 
 KERNELS = ("asfm", "rik")
 _ENERGY = 0.99  # of the kernel's spectrum, that the basis keeps
 
 
 @one_thread
-def riks(W, visible=None, rank=None, basis=0.2, kernel="asfm", max_seconds=None, progress=True):
+def riks(
+    W: Any,
+    visible: Any = None,
+    *,
+    confidence: Any = None,
+    rank: int | None = None,
+    basis: float = 0.2,
+    kernel: str = "asfm",
+    max_seconds: float | None = None,
+    progress: bool = True,
+) -> Reconstruction:
     """As column space fitting, but coefficients are smooth over *likeness of images* instead of time.
 
     Objective: ``min Σ_f ‖X_f − Σ_k c_fk B_k M_f‖²`` with C = Φ Z, where Φ (F, d) are the main components of a
@@ -35,6 +52,9 @@ def riks(W, visible=None, rank=None, basis=0.2, kernel="asfm", max_seconds=None,
     W : Landmarks, or (F, P, 2) array of image points
     visible : (F, P) bool, optional
         Hidden points are filled in by `complete` first.
+    confidence : (F, P), optional
+        From 0 to 1; `complete` moves a doubtful point towards its likely place. Default: that of the Landmarks,
+        else 1.
     rank : int, optional
         Number of atoms K, with 3K at most P and 2F. The authors take 5 to 8, others 3 for `pickup`. Default: 7, or
         the largest possible.
@@ -47,44 +67,53 @@ def riks(W, visible=None, rank=None, basis=0.2, kernel="asfm", max_seconds=None,
 
     Returns
     -------
-    Reconstruction in one world frame for all frames.
+    Reconstruction in one world frame for all frames, in the units of W.
 
     Raises
     ------
     ValueError
-        As `images.read` and `trajectory_cameras`; for a parameter out of range; or if memory or time would not
-        suffice.
+        As `images.read`, with fewer than 6 frames or points; as `trajectory_cameras`; for a parameter out of range;
+        or if memory or time would not suffice.
 
     Notes
     -----
     Certain: all of it, from the authors' code (their first algorithm). Their second one, which fits rank by rank
     with weights on the points, is left out.
+
+    References
+    ----------
+    Hamsici, Gotardo, Martinez (2012). Learning spatially-smooth mappings in non-rigid structure from motion. ECCV,
+    260–273.
+
+    Examples
+    --------
+    >>> views = nl.datasets.make_views(nl.datasets.make_motion(30))
+    >>> nl.baselines.riks(views, rank=3, progress=False).shapes.shape == views.points3d.shape
+    True
     """
-    images = read(W, visible, frames=6, points=6, method="riks")
+    images = completed(read(W, visible, confidence, method="riks", frames=6, points=6))
     F, P, _ = images.X.shape
     rank = choose_rank(rank, 7, 1, F, P)
-    check_share("basis", basis)
-    if kernel not in KERNELS:
-        raise ValueError(f"kernel={kernel!r}; expected one of {', '.join(KERNELS)}.")
-    d = max(rank, round(basis * F))
+    d = choose_components("basis", basis, rank, F)
+    one_of("kernel", kernel, KERNELS)
     check_cost("riks", F, *_cost(F, P, d, rank), max_seconds, "A smaller basis takes fewer components.")
     watch = Watch("riks", max_seconds, progress)
-    M = trajectory_cameras(images.X)
+    M = trajectory_cameras(images.X, watch)
     distances = _unlike_in_space(images.X) if kernel == "asfm" else _unlike_in_the_plane(images.X)
     components = _components(distances, d, watch)
     coefficients, start = linear(components, rank)
     S, done = fit(images.X, M, coefficients, start, watch, sequential=True, iterations=300, tolerance=1e-9)
-    return images.reconstruction(S, M, "riks", done)
+    return images.reconstruction(S, M, method="riks", converged=done)
 
 
-def _unlike_in_the_plane(X):
+def _unlike_in_the_plane(X: np.ndarray) -> np.ndarray:
     """(F, F): how far two images are from a rotation of each other in the plane, 0 to 2."""
     z = X[..., 0] + 1j * X[..., 1]
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
     return np.maximum(2 - 2 * np.abs(z @ z.conj().T), 0)
 
 
-def _unlike_in_space(X):
+def _unlike_in_space(X: np.ndarray) -> np.ndarray:
     """(F, F): the energy of two images, stacked to four rows, outside their best rank 3, which a rigid body has."""
     F = len(X)
     rows = stacked(X)
@@ -98,7 +127,7 @@ def _unlike_in_space(X):
     return ((E + E.T) / 2).numpy()
 
 
-def _components(E, d, watch):
+def _components(E: np.ndarray, d: int, watch: Watch) -> np.ndarray:
     """(F, d): main components of the kernel, its width chosen so that d of them hold most of the spectrum."""
     ordered = np.sort(E, axis=1)
     low, high = 1, len(E) - 1
@@ -113,12 +142,12 @@ def _components(E, d, watch):
     return V[:, main] * np.sqrt(np.abs(values[main]))
 
 
-def _kernel(E, ordered, neighbour):
+def _kernel(E: np.ndarray, ordered: np.ndarray, neighbour: int) -> np.ndarray:
     """exp(−E / 2σ²), with σ² the mean distance to the neighbour of that rank."""
     return np.exp(-E / (2 * max(ordered[:, neighbour].mean(), 1e-300)))
 
 
-def _cost(F, P, d, rank):
+def _cost(F: int, P: int, d: int, rank: int) -> tuple[float, float]:
     """Gigabytes and seconds, roughly."""
     n = d * rank
     gigabytes = 8 * (6 * F**2 + 6 * F * rank**2 * P + 7 * n**2) / 2**30

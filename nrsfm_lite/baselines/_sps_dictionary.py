@@ -4,7 +4,11 @@ A frame is its two image rows (2, P). An atom is an orthonormal basis U_j (P, 3)
 rows_f ≈ Σ_k codes_fk U_jᵀ with j = support_fk and codes of size 2×3, one block per active atom.
 """
 
+from __future__ import annotations
+
 import numpy as np
+
+from .shared.limits import Watch
 
 # The convex start (lengths relative to that of a mean image row)
 _START_STEPS = 300  # the penalty on the atoms' split has grown to where they no longer move
@@ -20,7 +24,9 @@ _RARE = 0.2  # an atom that is used by less than this share of an atom's mean nu
 _RIDGE = 1e-10  # keeps the fit on two coinciding atoms solvable
 
 
-def learn_atoms(rows, atoms, active, rng, watch, what):
+def learn_atoms(
+    rows: np.ndarray, atoms: int, active: int, rng: np.random.Generator, watch: Watch, what: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, bool]:
     """Subspaces that represent every frame by few of them: ADMM for a start, then block K-SVD.
 
     Parameters
@@ -42,18 +48,18 @@ def learn_atoms(rows, atoms, active, rng, watch, what):
     U = convex_start(rows, atoms, rng, watch, what)
     size, history, settled = np.linalg.norm(rows), [], False
     for _ in watch.steps(_STEPS, f"{what}, block K-SVD"):
-        support, codes, rest = block_omp(U, rows, active)
-        history.append(np.linalg.norm(rest) / size)
+        support, codes, residual = block_omp(U, rows, active)
+        history.append(np.linalg.norm(residual) / size)
         stale = len(history) > _WARM_UP and history[-1 - _PATIENCE] - history[-1] < _SETTLED * history[-1]
         settled = history[-1] < _EXACT or stale
         if settled:
             break
-        _update_atoms(U, rows, support, codes, rest, rng)
-    support, codes, rest = block_omp(U, rows, active)
-    return U, support, codes, np.linalg.norm(rest) / size, settled
+        _update_atoms(U, rows, support, codes, residual, rng)
+    support, codes, residual = block_omp(U, rows, active)
+    return U, support, codes, np.linalg.norm(residual) / size, settled
 
 
-def convex_start(rows, atoms, rng, watch, what):
+def convex_start(rows: np.ndarray, atoms: int, rng: np.random.Generator, watch: Watch, what: str) -> np.ndarray:
     """Atoms from ``min ½‖W − C A‖² + γ Σ ‖C_fj‖_F``, rows of A at most of length 1, by ADMM from a random start.
 
     W are the images stacked (2F, P), C (2F, 3·atoms) has blocks C_fj of 2×3. Both factors are split from their
@@ -84,14 +90,14 @@ def convex_start(rows, atoms, rng, watch, what):
     return np.linalg.qr(short.reshape(atoms, 3, P).transpose(0, 2, 1))[0]
 
 
-def _shrink(C, threshold, atoms):
+def _shrink(C: np.ndarray, threshold: float, atoms: int) -> np.ndarray:
     """Block soft threshold: every 2×3 block shorter by `threshold`, or zero."""
     blocks = C.reshape(-1, 2, atoms, 3)
     length = np.sqrt(np.einsum("fijk,fijk->fj", blocks, blocks))[:, None, :, None]
     return (blocks * np.maximum(0, 1 - threshold / np.maximum(length, 1e-12))).reshape(C.shape)
 
 
-def block_omp(U, rows, active):
+def block_omp(U: np.ndarray, rows: np.ndarray, active: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The atoms of every frame, one after the other, all frames at once.
 
     The next atom is the one in whose subspace most of the residual lies, max_j ‖r_f U_j‖_F; then the codes of all
@@ -100,7 +106,7 @@ def block_omp(U, rows, active):
     Returns
     -------
     support, codes : as in `learn_atoms`
-    rest : (F, 2, P), the residual
+    residual : (F, 2, P), the residual
     """
     (F, _, P), atoms = rows.shape, len(U)
     D = U.transpose(1, 0, 2).reshape(P, 3 * atoms)
@@ -118,11 +124,18 @@ def block_omp(U, rows, active):
         if size < active:
             left = inner - codes @ gram[columns]
     codes = codes.reshape(F, 2, active, 3).swapaxes(1, 2).copy()
-    rest = rows - sum(codes[:, k] @ U.swapaxes(1, 2)[support[:, k]] for k in range(active))
-    return support, codes, rest
+    residual = rows - sum(codes[:, k] @ U.swapaxes(1, 2)[support[:, k]] for k in range(active))
+    return support, codes, residual
 
 
-def _update_atoms(U, rows, support, codes, rest, rng):
+def _update_atoms(
+    U: np.ndarray,
+    rows: np.ndarray,
+    support: np.ndarray,
+    codes: np.ndarray,
+    residual: np.ndarray,
+    rng: np.random.Generator,
+) -> None:
     """One pass over the atoms, in place: each becomes the best subspace for the frames that use it.
 
     An atom that hardly any frame uses becomes one of the 20 worst represented frames and a random direction.
@@ -131,11 +144,11 @@ def _update_atoms(U, rows, support, codes, rest, rng):
     for j in range(len(U)):
         f, k = np.nonzero(support == j)
         if len(f) < _RARE * mean_uses:
-            worst = rng.choice(np.argsort(-np.square(rest).sum((1, 2)))[:20])
+            worst = rng.choice(np.argsort(-np.square(residual).sum((1, 2)))[:20])
             U[j] = np.linalg.qr(np.vstack([rows[worst], rng.normal(size=P)]).T)[0]
             continue
-        alone = rest[f] + codes[f, k] @ U[j].T  # what the other atoms leave to this one
+        alone = residual[f] + codes[f, k] @ U[j].T  # what the other atoms leave to this one
         flat = alone.reshape(-1, P)
         U[j] = np.linalg.eigh(flat.T @ flat)[1][:, -3:]
         codes[f, k] = alone @ U[j]
-        rest[f] = alone - codes[f, k] @ U[j].T
+        residual[f] = alone - codes[f, k] @ U[j].T

@@ -1,10 +1,14 @@
 """The depths of a few points by low rank alone: the building block of consensus (Lee, Cho & Oh, 2016)."""
 
+from __future__ import annotations
+
 import numpy as np
 import torch
 from scipy.linalg import helmert
+from torch import Tensor
 
 from ..cameras import nearest_orthonormal
+from .shared.descent import nesterov
 
 _ENERGY = 1 - 1e-5  # of the images, that the columns for the cameras hold
 _EPS = torch.finfo(torch.float64).eps
@@ -14,7 +18,7 @@ _GROWTH = 1.02  # of the penalty, per iteration
 _GAP = 1e-10  # squared distance of the shapes from their low-rank copies, at which they count as equal
 
 
-def weak_depths(W):
+def weak_depths(W: Tensor) -> Tensor:
     """Depths of groups of points, each group on its own and up to its sign.
 
     Cameras first: the images of a group, stacked (2F, n), are factored, and a positive matrix Q of trace one and
@@ -39,15 +43,15 @@ def weak_depths(W):
     W = basis @ W
     size = W.norm(dim=(2, 3), keepdim=True).clamp(min=1e-12)
     W = W / size
-    M, stretch = group_cameras(W)
-    laid = W / stretch[:, :, None, None] @ M.mT  # (G, F, n − 1, 3): the images in their planes in space
-    sign = _alike(laid)[..., None, None]
+    M, scale = group_cameras(W)
+    spatial = W / scale[:, :, None, None] @ M.mT  # (G, F, n − 1, 3): the images in their planes in space
+    sign = _alike(spatial)[..., None, None]
     view = torch.linalg.cross(M[..., 0], M[..., 1])  # the same for a camera and its negative
-    z = lowest_rank_depths((laid * sign).permute(0, 3, 2, 1).contiguous(), view.mT.contiguous())
-    return basis.T @ (z * (size[:, :, 0, 0] * stretch)[:, None])
+    z = lowest_rank_depths((spatial * sign).permute(0, 3, 2, 1).contiguous(), view.mT.contiguous())
+    return basis.T @ (z * (size[:, :, 0, 0] * scale)[:, None])
 
 
-def group_cameras(W):
+def group_cameras(W: Tensor) -> tuple[Tensor, Tensor]:
     """Cameras (G, F, 3, 2) of centred images W (G, F, q, 2), and the scale of each frame, 1 or more: (G, F).
 
     The upgrade is found on three columns of the factor first, then on three more at a time, until it is
@@ -70,13 +74,13 @@ def group_cameras(W):
         growing = growing[cost * size >= _EPS]
     blocks = (U.view(G, 2 * F, q) @ torch.as_tensor(factor)).view(G, F, 2, 3).mT
     M = nearest_orthonormal(blocks)
-    stretch = (M * blocks).sum((2, 3))  # twice the mean of the two singular values
+    scale = (M * blocks).sum((2, 3))  # twice the mean of the two singular values
     # A block without extent says nothing about the scale; it must not blow up all others.
-    stretch = stretch.clamp(min=1e-3 * stretch.median(1, keepdim=True).values)
-    return M, stretch / stretch.amin(1, keepdim=True)
+    scale = scale.clamp(min=1e-3 * scale.median(1, keepdim=True).values)
+    return M, scale / scale.amin(1, keepdim=True)
 
 
-def constraints(U):
+def constraints(U: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """What Q has to make zero in every frame: m₁ᵀ Q m₁ − m₂ᵀ Q m₂ and 2 m₁ᵀ Q m₂, as a matrix of unit norm.
 
     Parameters
@@ -103,7 +107,7 @@ def constraints(U):
     return full.flatten(2).numpy(), norm.square().numpy()
 
 
-def upgrade(A, factor, accelerate):
+def upgrade(A: np.ndarray, factor: np.ndarray, accelerate: bool) -> tuple[np.ndarray, np.ndarray]:
     """min ‖A vec(Q)‖² over positive Q of trace one and rank three, by projected gradients.
 
     With three columns the set is convex, and the steps are accelerated (Nesterov); with more it is not, and plain
@@ -125,32 +129,31 @@ def upgrade(A, factor, accelerate):
     factor = factor / np.linalg.norm(factor, axis=(1, 2), keepdims=True)
     Q = factor @ factor.swapaxes(1, 2)
     ahead, momentum = Q, 1.0
-    image = pull = _apply(A, Q)
+    image = residual = _apply(A, Q)
     cost = np.square(image).sum(1)
     for step in range(_UPGRADE_STEPS):
         Q_before, image_before, cost_before = Q, image, cost
-        factor = _nearest_factor(ahead - (pull[:, None] @ A).reshape(Q.shape))
+        factor = _nearest_factor(ahead - (residual[:, None] @ A).reshape(Q.shape))
         Q = factor @ factor.swapaxes(1, 2)
         image = _apply(A, Q)
         cost = np.square(image).sum(1)
         if accelerate:
-            bound = np.square(Q - ahead).sum((1, 2)) + cost - np.square(image - pull).sum(1)
+            bound = np.square(Q - ahead).sum((1, 2)) + cost - np.square(image - residual).sum(1)
             done = (bound <= (1 + 1e-12) * cost) | (bound <= _EPS)
-            momentum_before, momentum = momentum, (1 + (1 + 4 * momentum**2) ** 0.5) / 2
-            speed = (momentum_before - 1) / momentum
-            ahead, pull = Q + speed * (Q - Q_before), image + speed * (image - image_before)
+            momentum, share = nesterov(momentum)
+            ahead, residual = Q + share * (Q - Q_before), image + share * (image - image_before)
         else:
             done = cost_before <= (1 + 1e-6) * cost
-            ahead, pull = Q, image
+            ahead, residual = Q, image
         if done.any() or step == _UPGRADE_STEPS - 1:
             result[left], costs[left] = factor, cost
-            left, A, Q, image, cost, ahead, pull = (x[~done] for x in (left, A, Q, image, cost, ahead, pull))
+            left, A, Q, image, cost, ahead, residual = (x[~done] for x in (left, A, Q, image, cost, ahead, residual))
             if not len(left):
                 break
     return result, costs
 
 
-def lowest_rank_depths(X, view):
+def lowest_rank_depths(X: Tensor, view: Tensor) -> Tensor:
     """Depths that make shapes in space low in rank.
 
     Parameters
@@ -195,21 +198,21 @@ def lowest_rank_depths(X, view):
     return result
 
 
-def _alike(laid):
-    """Signs (G, F) that make every frame of laid (G, F, q, 3) correlate with the mean of its group."""
-    laid = laid.flatten(2)
-    sign = torch.ones(laid.shape[:2], dtype=laid.dtype)
-    mean = laid[:, 0]
-    for _ in range(laid.shape[1]):
-        wrong = sign * (laid @ mean[..., None])[..., 0] < 0
+def _alike(spatial: Tensor) -> Tensor:
+    """Signs (G, F) that make every frame of back-projected images (G, F, q, 3) correlate with the mean of its group."""
+    spatial = spatial.flatten(2)
+    sign = torch.ones(spatial.shape[:2], dtype=spatial.dtype)
+    mean = spatial[:, 0]
+    for _ in range(spatial.shape[1]):
+        wrong = sign * (spatial @ mean[..., None])[..., 0] < 0
         if not wrong.any():
             break
         sign = torch.where(wrong, -sign, sign)
-        mean = (sign[..., None] * laid).mean(1)
+        mean = (sign[..., None] * spatial).mean(1)
     return sign
 
 
-def _nearest_factor(Q):
+def _nearest_factor(Q: np.ndarray) -> np.ndarray:
     """The factor (G, K, 3) of the positive matrix of rank three and trace one nearest to Q (G, K, K)."""
     values, vectors = np.linalg.eigh(Q)
     values, vectors = values[:, :-4:-1], vectors[:, :, :-4:-1]  # the three largest, in descending order
@@ -218,6 +221,6 @@ def _nearest_factor(Q):
     return vectors * np.sqrt((values - lower).clip(0))[:, None]
 
 
-def _apply(A, Q):
+def _apply(A: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """A vec(Q), for each group: (G, r)."""
     return (A @ Q.reshape(len(Q), -1, 1))[..., 0]

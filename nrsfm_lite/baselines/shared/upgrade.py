@@ -1,15 +1,62 @@
-"""From factors to cameras: Euclidean upgrades, for videos and for frames in no order, and the signs of frames."""
+"""From factors to cameras: metric upgrades, for videos and for frames in no order, and the signs of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from ..cameras import nearest_orthonormal
-from .images import stacked
+from ...cameras import nearest_orthonormal
+from .limits import Watch
 
 
-def trajectory_cameras(X):
-    """Cameras of a smooth motion, by the Euclidean upgrade that PTA and its successors share.
+def stacked(X: np.ndarray) -> np.ndarray:
+    """(F, P, 2) to (2F, P): two rows per frame, x and y."""
+    return X.transpose(0, 2, 1).reshape(-1, X.shape[1])
+
+
+def orthonormal(M: np.ndarray) -> np.ndarray:
+    """The cameras nearest to (..., 3, 2) matrices."""
+    return nearest_orthonormal(torch.as_tensor(np.ascontiguousarray(M))).numpy()
+
+
+def metric_gram(rows: np.ndarray, *, one_scale: bool) -> np.ndarray:
+    """Q = G Gᵀ such that the two rows of rows_f @ G are orthogonal and of one length, in the least-squares sense.
+
+    All conditions are linear in the six entries of Q.
+
+    Parameters
+    ----------
+    rows : (n, 2, 3)
+    one_scale : bool
+        The common length is 1 in every frame. Else each frame has its own, and Q is only known up to a factor of
+        either sign: it has norm 1 as a vector of six.
+
+    Returns
+    -------
+    (3, 3), symmetric, but with noise not always positive
+    """
+    i, j = np.triu_indices(3)
+
+    def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:  # aᵀ Q b as a linear function of the entries of Q
+        return np.where(i == j, 0.5, 1) * (a[:, i] * b[:, j] + a[:, j] * b[:, i])
+
+    x, y = rows[:, 0], rows[:, 1]
+    if one_scale:
+        system = np.concatenate([product(x, x), product(y, y), product(x, y)])
+        entries = np.linalg.lstsq(system, np.repeat([1.0, 1.0, 0.0], len(rows)), rcond=None)[0]
+    else:
+        system = np.concatenate([product(x, x) - product(y, y), 2 * product(x, y)])
+        entries = np.linalg.svd(system, full_matrices=len(system) < 6)[2][-1]
+    Q = np.zeros((3, 3))
+    Q[i, j] = Q[j, i] = entries
+    return Q
+
+
+def trajectory_cameras(X: np.ndarray, watch: Watch) -> np.ndarray:
+    """Cameras of a smooth motion, by the metric upgrade that PTA and its successors share.
 
     The centred images stacked (2F, P) are factored by singular value decomposition. Three columns Q
     of the upgrade are found such that each frame's two rows become orthonormal: first on the 6
@@ -20,6 +67,7 @@ def trajectory_cameras(X):
     Parameters
     ----------
     X : (F, P, 2) image points, each frame centred
+    watch : limits.Watch; when its time is over, no more components are added
 
     Returns
     -------
@@ -41,7 +89,7 @@ def trajectory_cameras(X):
         raise ValueError(f"W has {len(s)} components; the cameras of a deforming shape need at least 6 points.")
     motion = (U[:, :n] * np.sqrt(s[:n])).reshape(F, 2, n)
     Q, best = np.eye(6, 3), np.inf
-    for size in range(6, n + 1, 3):
+    for size in watch.steps(range(6, n + 1, 3), "cameras"):
         Q = np.vstack([Q, np.zeros((size - len(Q), 3))])
         part = np.ascontiguousarray(motion[:, :, :size])
         found = minimize(_misfit, Q.ravel(), args=(part,), jac=True, method="BFGS", options={"gtol": 1e-9})
@@ -52,7 +100,7 @@ def trajectory_cameras(X):
     return continuous(rows).transpose(0, 2, 1)
 
 
-def _misfit(q, motion):
+def _misfit(q: np.ndarray, motion: np.ndarray) -> tuple[float, np.ndarray]:
     """How far the rows of motion_f @ Q are from orthonormal, and its gradient."""
     Q = q.reshape(motion.shape[2], 3)
     R = (motion.reshape(-1, len(Q)) @ Q).reshape(-1, 2, 3)
@@ -66,7 +114,7 @@ def _misfit(q, motion):
     return value, gradient.ravel()
 
 
-def unordered_cameras(X, rank, starts, rng):
+def unordered_cameras(X: np.ndarray, rank: int, starts: Iterable, rng: np.random.Generator) -> np.ndarray:
     """Cameras of shapes of low rank, in any order of the frames: the upgrade of the block matrix method.
 
     As in `trajectory_cameras`, three columns G of the upgrade make each frame's two rows orthonormal, here of any
@@ -97,11 +145,10 @@ def unordered_cameras(X, rank, starts, rng):
         found = minimize(_ratio_misfit, first.ravel(), args=(motion,), jac=True, method="BFGS", options={"gtol": 1e-8})
         best = found if best is None or found.fun < best.fun else best
     rows = motion @ best.x.reshape(n, 3)  # (F, 2, 3)
-    M = nearest_orthonormal(torch.as_tensor(rows.transpose(0, 2, 1).copy())).numpy()
-    return consistent(M, X)
+    return consistent(orthonormal(rows.transpose(0, 2, 1)), X)
 
 
-def _ratio_misfit(g, motion):
+def _ratio_misfit(g: np.ndarray, motion: np.ndarray) -> tuple[float, np.ndarray]:
     """How far the rows of motion_f @ G are from equal length and a right angle, and its gradient."""
     flat = motion.reshape(-1, motion.shape[2])
     r1, r2 = (flat @ g.reshape(-1, 3)).reshape(-1, 2, 3).transpose(1, 0, 2)  # (F, 3) each
@@ -114,21 +161,7 @@ def _ratio_misfit(g, motion):
     return (length**2).sum() + (angle**2).sum(), (flat.T @ by_rows.reshape(-1, 3)).ravel()
 
 
-def quadratic(a, b):
-    """aᵀ Q b as a linear function of the six entries of a symmetric Q, `symmetric`'s argument: (n, 3) twice, (n, 6)."""
-    i, j = np.triu_indices(3)
-    return np.where(i == j, 0.5, 1) * (a[:, i] * b[:, j] + a[:, j] * b[:, i])
-
-
-def symmetric(q):
-    """The symmetric 3×3 matrix of its six entries on and above the diagonal, row by row."""
-    Q = np.zeros((3, 3))
-    i, j = np.triu_indices(3)
-    Q[i, j] = Q[j, i] = q
-    return Q
-
-
-def continuous(rows):
+def continuous(rows: np.ndarray) -> np.ndarray:
     """Negate frames whose camera would turn by more than 90° from the frame before: (F, 2, 3)."""
     rows = rows.copy()
     for f in range(1, len(rows)):
@@ -137,11 +170,11 @@ def continuous(rows):
     return rows
 
 
-def consistent(M, X):
-    """Negate cameras so that the images, laid back into space, look alike: for frames in no order.
+def consistent(M: np.ndarray, X: np.ndarray) -> np.ndarray:
+    """Negate cameras so that the back-projected images look alike: for frames in no order.
 
-    A camera and its negative explain the squares of an image equally well. Each image is laid into its plane in
-    space, X_f M_fᵀ, and a frame that correlates negatively with the mean of all is negated, until none does
+    A camera and its negative explain the squares of an image equally well. Each image is back-projected into its
+    plane in space, X_f M_fᵀ, and a frame that correlates negatively with the mean of all is negated, until none does
     (Lee et al., 2016).
 
     Parameters
@@ -153,12 +186,12 @@ def consistent(M, X):
     -------
     (F, 3, 2)
     """
-    laid = (X @ M.swapaxes(1, 2)).reshape(len(X), -1)
+    spatial = (X @ M.swapaxes(1, 2)).reshape(len(X), -1)
     # Start from the main direction of all frames, whatever their signs.
-    sign = np.sign(laid @ np.linalg.eigh(laid.T @ laid)[1][:, -1])
+    sign = np.sign(spatial @ np.linalg.eigh(spatial.T @ spatial)[1][:, -1])
     sign[sign == 0] = 1
     for _ in range(len(X)):
-        signed = laid * sign[:, None]
+        signed = spatial * sign[:, None]
         wrong = signed @ signed.mean(0) < 0
         if not wrong.any():
             break

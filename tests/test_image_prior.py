@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import nrsfm_lite as nl
-from nrsfm_lite import completion, preprocessing
+from nrsfm_lite import image_prior, normalizer
 from nrsfm_lite.threads import use_threads
 
 
@@ -22,8 +22,8 @@ def body():
     full, part = (nl.datasets.make_views(data, missing=m) for m in (0, 0.2))
     seen = torch.as_tensor(part.visible)
     W = torch.as_tensor(full.points2d)
-    X, _ = preprocessing.center(torch.where(seen[..., None], W, 0.0), seen)
-    return W / preprocessing.set_scale(X, seen), X / preprocessing.set_scale(X, seen), seen
+    X, _ = normalizer.center(torch.where(seen[..., None], W, 0.0), seen)
+    return W / normalizer.set_scale(X, seen), X / normalizer.set_scale(X, seen), seen
 
 
 @pytest.mark.parametrize("weight", [[1, 0, 1, 1, 0], [1, 0.5, 0, 0.1, 1], [0.2, 0.1, 0, 0.02, 0.2]])
@@ -40,25 +40,25 @@ def test_a_hidden_point_is_put_at_its_conditional_mean(weight):
     likely = Sigma[:, seen] @ np.linalg.solve(Sigma[np.ix_(seen, seen)] + np.diag(noise), x[0, seen])
     expected = np.where((w == 1)[:, None], x[0], likely)
     expected -= expected.mean(0)
-    filled = completion.fill(torch.as_tensor(G), torch.as_tensor(x), torch.as_tensor(given)[None])
+    filled = image_prior.fill(torch.as_tensor(G), torch.as_tensor(x), torch.as_tensor(given)[None])
     np.testing.assert_allclose(filled[0], expected, atol=1e-10)
 
 
 def test_learning_from_complete_images_is_their_covariance_and_few_hidden_points_change_it_little(body):
     W, X, seen = body
-    whole = completion.learn(W, torch.ones_like(seen))
+    whole = image_prior.learn(W, torch.ones_like(seen))
     rows = W.mT.reshape(-1, 31)
     torch.testing.assert_close(whole, torch.cov(rows.T, correction=0) + torch.outer(rows.mean(0), rows.mean(0)))
-    part = completion.learn(X, seen)
+    part = image_prior.learn(X, seen)
     assert (part - whole).norm() < 0.05 * whole.norm()
     torch.testing.assert_close(part.sum(0), torch.zeros(31, dtype=torch.double), atol=1e-6, rtol=0)
 
 
 def test_it_foretells_hidden_points_far_better_than_the_mean_of_the_others(body):
     W, X, seen = body
-    filled = completion.fill(completion.learn(X, seen), X, seen)
+    filled = image_prior.fill(image_prior.learn(X, seen), X, seen)
     truth = W - W.mean(1, keepdim=True)
     missed = (filled - truth)[~seen].norm() / truth[~seen].norm()
     assert missed < 0.15
-    alone = completion.fill(completion.learn(X, seen), X[3:4], seen[3:4])  # a frame does not need the others
+    alone = image_prior.fill(image_prior.learn(X, seen), X[3:4], seen[3:4])  # a frame does not need the others
     torch.testing.assert_close(alone[0], filled[3])

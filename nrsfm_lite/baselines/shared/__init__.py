@@ -1,0 +1,1 @@
+"""What several classical methods use: limits, completion, cameras from factors, and two kinds of descent."""
