@@ -168,7 +168,15 @@ def nearest_orthonormal(A: Tensor) -> Tensor:
 
 
 def polar(A: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """`nearest_orthonormal` and what its gradient needs: M, (AᵀA)^(-1/2) and 1 / (σ₁ + σ₂), both 0 if degenerate."""
+    """`nearest_orthonormal` and what its gradient needs: M, (AᵀA)^(-1/2) and 1 / (σ₁ + σ₂), both 0 if degenerate.
+
+    A is a (..., 3, 2) tensor.
+
+    >>> M, inverse, per_total = nl.cameras.polar(2 * torch.eye(3, 2))
+    >>> inverse, per_total.squeeze()
+    (tensor([[0.5000, 0.0000],
+            [0.0000, 0.5000]]), tensor(0.2500))
+    """
     size = A.square().sum((-2, -1), keepdim=True)  # ‖A‖²
     size = torch.where(size > 0, size, torch.ones_like(size)).sqrt()
     A = A / size  # no under- or overflow below
@@ -185,12 +193,16 @@ def polar(A: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return M, torch.where(good, inverse, 0.0), torch.where(good, 1 / (total * size), 0.0)
 
 
-def polar_gradient(g: Tensor, M: Tensor, inverse: Tensor, per_total: Tensor) -> Tensor:
-    """Gradient before the polar factor, of g (..., 3, 2) after it; the other arguments come from `polar`.
+def polar_gradient(g: Tensor, found: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+    """Gradient before the polar factor, of g (..., 3, 2) after it; `found` is what `polar` returned.
 
     What moves the columns out of their plane is divided by the singular values, what turns them inside
-    it by their sum. No difference of singular values appears.
+    it by their sum. No difference of singular values appears (chapter 07).
+
+    >>> nl.cameras.polar_gradient(torch.ones(3, 2), nl.cameras.polar(2 * torch.eye(3, 2)))[2]
+    tensor([0.5000, 0.5000])
     """
+    M, inverse, per_total = found
     inner = M.mT @ g
     angle = (inner[..., 0, 1] - inner[..., 1, 0])[..., None, None] * per_total
     turned = torch.stack([-M[..., 1], M[..., 0]], -1)
@@ -209,7 +221,7 @@ class _Polar(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, g):
-        return polar_gradient(g, *ctx.saved_tensors)
+        return polar_gradient(g, ctx.saved_tensors)
 
 
 def rotation_error(M: Any, M_true: Any, *, degrees: bool = True) -> np.ndarray:

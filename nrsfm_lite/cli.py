@@ -36,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Examples
     --------
-    >>> main(["reconstruct", "points.npz", "--out", "scene.html"])  # doctest: +SKIP
+    >>> nl.cli.main(["reconstruct", "points.npz", "--out", "scene.html"])  # doctest: +SKIP
     0
     """
     arguments = _parser().parse_args(argv)

@@ -326,7 +326,6 @@ def read_npz(path: str | Path, keys: Collection[str] | None = None) -> dict[str,
         raise ValueError(f"{path}: could not be read as .npz ({error}).") from None
 
 
-_as_array = checks.as_array
 
 
 def _names_and_edges(names: Any, edges: Any, n_points: int) -> tuple[tuple[str, ...], np.ndarray]:

@@ -67,7 +67,8 @@ def backpropagate(
     for Di, bi in zip(D, b, strict=True):
         codes.append(_threshold(torch.addmm(bi, codes[-1], Di, beta=-1), bi, soft))  # (2 rows B, K_i)
     Z = codes[-1]
-    M, *rest = polar((Z @ gamma).view(B, 2, rows)[:, :, :3].mT.contiguous())
+    found = polar((Z @ gamma).view(B, 2, rows)[:, :, :3].mT.contiguous())
+    M = found[0]
     psi = Z.view(B, -1) @ beta if net.config.beta == "full" else beta @ Z.view(B, 2 * rows, -1)
     sign = psi.sign() if soft else None
     decoded = [psi.abs() if soft else psi]
@@ -104,7 +105,7 @@ def backpropagate(
         dD.append(g.mT @ decoded[-2 - i])
         g = g @ Di
     g = g * sign if soft else g
-    gA = polar_gradient(gM, M, *rest).mT
+    gA = polar_gradient(gM, found).mT
     if rows == 4:
         gA = torch.nn.functional.pad(gA, (0, 1))  # no camera in the fourth row
     gA = gA.reshape(-1)

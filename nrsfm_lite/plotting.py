@@ -158,7 +158,7 @@ def show2d(W: Any, edges: Any = None, *, frames: Any = None, visible: Any = None
     middle = np.nanmean(W[frames], axis=1)
     reach = 1.1 * np.nanmax(np.abs(W[frames] - middle[:, None])) or 1.0  # all points at one place
     for axis, f, (x, y) in zip(axes[0], frames, middle, strict=True):
-        draw2d(axis, W[f], edges, SEEN)
+        draw2d(axis, W[f], edges, colour=SEEN)
         axis.set(xlim=(x - reach, x + reach), ylim=(y - reach, y + reach))
         axis.set_title(f"frame {f}", fontsize=9)
         axis.spines[:].set(color=TRUE, visible=True)
@@ -219,18 +219,18 @@ def compare(rec: Reconstruction, truth: Landmarks, frames: Any = None, *, column
         line[0].set_ylabel(title, color=INK)
         for i, axis in enumerate(line):
             for points, colour in layers:
-                draw2d(axis, points[i], truth.edges, colour)
+                draw2d(axis, points[i], truth.edges, colour=colour)
             axis.set(xlim=(-reach, reach), ylim=(-reach, reach))
     return figure
 
 
-def draw2d(axis: Axes, points: Any, edges: Any, colour: str, *, label: str | None = None) -> None:
+def draw2d(axis: Axes, points: Any, edges: Any, *, colour: str, label: str | None = None) -> None:
     """One stick figure, points (P, 2), on a matplotlib axis; NaN points, and their edges, are left out.
 
     Raises ValueError if the points have another shape, or if an edge refers to a point that is not there.
 
     >>> import matplotlib.pyplot as plt
-    >>> nl.plotting.draw2d(plt.figure().subplots(), np.eye(3, 2), [(0, 1), (1, 2)], nl.plotting.TRUE)
+    >>> nl.plotting.draw2d(plt.figure().subplots(), np.eye(3, 2), [(0, 1), (1, 2)], colour="k")
     """
     points = checks.as_array("points", points, float)
     if points.ndim != 2 or points.shape[1] != 2:

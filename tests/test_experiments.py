@@ -1,15 +1,13 @@
 """The runner: every case once, provenance, and going on after an interruption."""
 
 import csv
-import doctest
 import json
-import math
 import types
 
 import pytest
 
 from nrsfm_lite import cli, experiments
-from nrsfm_lite.experiments.lab import process, runner, scoring
+from nrsfm_lite.experiments.lab import runner, scoring
 
 
 @pytest.fixture
@@ -91,9 +89,3 @@ def test_the_quick_form_of_every_experiment_runs(name, tmp_path, capsys):
     assert cli.main(["experiment", name, "--quick", "--out", str(tmp_path)]) == 0
     assert read(tmp_path / f"{name}.csv") and (tmp_path / f"{name}.json").exists()
     assert capsys.readouterr().out
-
-
-def test_the_examples_of_the_laboratory():
-    for module in (process, scoring):
-        done = doctest.testmod(module, extraglobs={"math": math})
-        assert done.attempted and not done.failed

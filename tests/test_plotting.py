@@ -160,7 +160,7 @@ def test_show2d_and_draw2d_refuse(motion):
     axis = matplotlib.figure.Figure().subplots()
     for points, edges, message in [(np.eye(3), [], r"points has shape \(3, 3\)"), (np.eye(3, 2), [(0, 3)], "outside")]:
         with pytest.raises(ValueError, match=message):
-            nl.plotting.draw2d(axis, points, edges, "k")
+            nl.plotting.draw2d(axis, points, edges, colour="k")
 
 
 @pytest.mark.filterwarnings("error")

@@ -180,7 +180,7 @@ def test_wrong_input_is_refused(views, rec):
         nl.reconstruct(views, model=rec.model, confidence=np.ones((600, 30)))
     with pytest.raises(ValueError, match="no visible point with confidence"):
         nl.reconstruct(views, model=rec.model, confidence=np.zeros((600, 31)))
-    with pytest.raises(ValueError, match="refine='codes'; expected True, False or 'code'"):
+    with pytest.raises(ValueError, match="refine='codes'; expected one of True, False, code"):
         nl.reconstruct(views, model=rec.model, refine="codes")
     with pytest.raises(ValueError, match="no points2d"):
         nl.reconstruct(nl.datasets.make_motion(20))

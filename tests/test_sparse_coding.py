@@ -71,7 +71,7 @@ def test_block_ista_meets_the_optimality_conditions(P, K, seed, hide):
     visible = draw(3, P, seed=seed + 2) > -0.8 if hide else None
     seen = W if visible is None else W * visible[..., None]
     lam = 0.3 * torch.einsum("kpi,bpj->bkij", D, seen).flatten(2).norm(dim=2).max().item() + 1e-3
-    Z = sc.block_ista(D, W, lam, visible, steps=20_000, tol=1e-14, accelerate=True)
+    Z = sc.block_ista(D, W, lam, visible=visible, steps=20_000, tol=1e-14, accelerate=True)
     assert block_violation(D, W, Z, lam, visible) < 1e-6
 
 
@@ -94,7 +94,7 @@ def test_block_ista_equals_an_independent_solver():
     residual = W[0].numpy() - sum(D[k].numpy() @ Z[k] for k in range(6))
     fit = 0.5 * cp.sum_squares(cp.multiply(visible[0].double().numpy()[:, None] @ np.ones((1, 2)), residual))
     cp.Problem(cp.Minimize(fit + lam * sum(cp.norm(z, "fro") for z in Z))).solve(cp.CLARABEL)
-    mine = sc.block_ista(D, W, lam, visible, steps=20_000, tol=1e-13)[0]
+    mine = sc.block_ista(D, W, lam, visible=visible, steps=20_000, tol=1e-13)[0]
     np.testing.assert_allclose(mine, np.stack([z.value for z in Z]), atol=1e-4)
     assert 0 < (mine.flatten(1).norm(dim=1) > 0).sum() < 6, "some blocks active, some not"
 
@@ -164,7 +164,7 @@ def test_hidden_points_do_not_matter_to_block_ista():
     visible = draw(4, 7, seed=2) > 0
     other = torch.where(visible[..., None], W, torch.nan)
     for exact in (True, False):
-        a, b = (sc.block_ista(D, w, 0.3, visible, exact=exact, steps=50) for w in (W, other))
+        a, b = (sc.block_ista(D, w, 0.3, visible=visible, exact=exact, steps=50) for w in (W, other))
         torch.testing.assert_close(a, b)
 
 
@@ -221,7 +221,7 @@ def test_coherence_of_special_dictionaries():
         (lambda: sc.ista(draw(4, 6), draw(5), 0.1), "do not fit"),
         (lambda: sc.block_ista(draw(4, 6), draw(2, 6, 2), 0.1), "do not fit"),
         (lambda: sc.block_ista(draw(3, 6, 3), draw(2, 5, 2), 0.1), "do not fit"),
-        (lambda: sc.block_ista(draw(3, 6, 3), draw(2, 6, 2), 0.1, torch.ones(2, 5) > 0), "visible has shape"),
+        (lambda: sc.block_ista(draw(3, 6, 3), draw(2, 6, 2), 0.1, visible=torch.ones(2, 5) > 0), "visible has shape"),
         (lambda: sc.hierarchical_code([draw(4, 6)], draw(4), [0.1, 0.2]), "1 dictionaries, but 2 thresholds"),
         (lambda: sc.mutual_coherence(np.ones((3, 1))), "K >= 2"),
         (lambda: sc.babel(np.eye(3), 3), "1 … 2"),
@@ -234,7 +234,7 @@ def test_coherence_of_special_dictionaries():
         (lambda: sc.fista(draw(4, 6), draw(4), 0.1, tol=-1), "tol=-1"),
         (lambda: sc.hierarchical_code([draw(4, 6)], draw(4), [0.1], steps=-1), "steps=-1"),
         (lambda: sc.block_ista(draw(3, 6, 3), torch.nan * draw(2, 6, 2), 0.1), "mark missing points as False"),
-        (lambda: sc.block_ista(draw(3, 6, 3), draw(2, 6, 2), 0.1, draw(2, 6)), "visible has values of type"),
+        (lambda: sc.block_ista(draw(3, 6, 3), draw(2, 6, 2), 0.1, visible=draw(2, 6)), "visible has values of type"),
     ],
 )
 def test_wrong_input_is_refused(call, message):

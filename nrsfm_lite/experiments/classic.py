@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from .. import baselines, cameras, metrics, quality
-from ..datasets import make_views
+from .. import baselines, cameras, datasets, metrics, quality
 from ..reconstruction import reconstruct
 from .lab import scoring
 
@@ -59,9 +58,9 @@ def conditions(quick: bool) -> dict[str, object]:
 
 def measure(data: str, method: str, seed: int) -> dict[str, object]:
     """Errors of one method on one sequence."""
-    truth = scoring.load(data)
+    truth = datasets.load(data)
     if truth.points2d is None:  # generated, of a quick run
-        truth = make_views(truth)
+        truth = datasets.make_views(truth)
     name, *variant = method.split()
     if name == "network":
         rec = reconstruct(truth.points2d, seed=seed, progress=False)

@@ -2,10 +2,8 @@
 
 import time
 
-from .. import baselines, metrics
+from .. import baselines, datasets, metrics
 from ..baselines.shared.limits import TooLarge
-from ..datasets import make_views
-from .lab import scoring
 from .lab.process import apart, peak_mb
 
 QUESTION = "How do time and memory of the classical methods grow with the number of frames?"
@@ -47,7 +45,7 @@ def report(rows: list[dict[str, str]]) -> str:
 
 
 def _reconstruct(data, method):
-    views = make_views(scoring.load(data))
+    views = datasets.make_views(datasets.load(data))
     how = {} if method in ("tomasi_kanade", "pta") else {"progress": False}
     baselines.tomasi_kanade(views[:20])  # libraries load on first use
     baselines.limits.LONG = _LONG  # in this process only

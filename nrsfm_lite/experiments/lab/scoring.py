@@ -19,16 +19,10 @@ QUICK_STEPS = 60
 _LONG = replace(SCHEDULES["default"], steps=2700, pull=0.0)
 
 
-@lru_cache(maxsize=4)
-def load(name: str) -> Landmarks:
-    """`datasets.load`, kept for the next case, which mostly asks for the same again."""
-    return datasets.load(name)
-
-
 @lru_cache
 def describe(name: str) -> dict[str, int | str]:
     """Frames, points and a hash of the 3D points, so that a result can be traced to its data."""
-    data = load(name)
+    data = datasets.load(name)
     digest = hashlib.sha256(np.ascontiguousarray(data.points3d, dtype=np.float32).tobytes()).hexdigest()
     return {"frames": len(data), "points": data.n_points, "sha256": digest[:16]}
 
@@ -74,7 +68,7 @@ def default_schedule(rates: float = 1.0, **changes: Any) -> Schedule:
 
 def views(data: str, **how: Any) -> tuple[Landmarks, Landmarks]:
     """Training frames (the first 80 % of the sequences) and unseen ones, each under its own random camera."""
-    return datasets.make_views(load(data), seed=0, **how).split()
+    return datasets.make_views(datasets.load(data), seed=0, **how).split()
 
 
 def train_and_score(data: str, seed: int, how: dict[str, Any], **config: Any) -> tuple[DeepNRSfM, dict[str, Any]]:
@@ -127,7 +121,7 @@ def variant_conditions(setting: str, quick: bool) -> dict[str, object]:
 
 def score_variant(data: str, seed: int, **setting: Any) -> dict[str, float]:
     """`score` of the default network with one setting changed."""
-    config = Config(load(data).n_points, **setting)
+    config = Config(datasets.load(data).n_points, **setting)
     train, test = views(data)
     net = fit(train, config=config, schedule=_LONG, steps=quick_steps(data), seed=seed, progress=False)
     return score(net, train, test)
