@@ -6,7 +6,7 @@ Shapes in comments: B frames, P points, K_i atoms of dictionary i, N dictionarie
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from .normalizer import Normalizer
 from .shape_prior import Gaussian, Prior
 from .sparse_coding import mutual_coherence
 
+_FOUND = ("scale", "origin", "covariance")  # fields of a `Normalizer` that training finds
+_OF_A_GAUSSIAN = ("mean", "covariance", "noise")
 EPSILON = 0.05  # ε of the 4×2 model: every entry of the row of translations in D₁, up to its sign
 
 
@@ -336,15 +338,27 @@ class DeepNRSfM(nn.Module):
         W[:, 0, 0], W[:, 1, 1] = 1, 1  # any two frames that are not a point
         return weights.to_onnx(self, W, path)
 
+    def get_extra_state(self) -> dict[str, Tensor]:
+        """Normaliser and prior, of which only what is in use: with the parameters, all of `state_dict`."""
+        state = {f"normalizer/{key}": torch.as_tensor(getattr(self.normalizer, key)) for key in _FOUND}
+        for i, gaussian in enumerate(self.prior or ()):
+            for key in _OF_A_GAUSSIAN:
+                state[f"prior/{i}/{key}"] = torch.as_tensor(getattr(gaussian, key))
+        return state
+
+    def set_extra_state(self, state: Mapping[str, Tensor]) -> None:
+        """Take over what `get_extra_state` gave."""
+        found = {key: state[f"normalizer/{key}"] for key in _FOUND}
+        self.normalizer = replace(self.normalizer, **found | {"scale": float(found["scale"])})
+        n = len({key.split("/")[1] for key in state if key.startswith("prior/")})
+        parts = [{key: state[f"prior/{i}/{key}"] for key in _OF_A_GAUSSIAN} for i in range(n)]
+        self.prior = tuple(Gaussian(p["mean"], p["covariance"], float(p["noise"])) for p in parts) or None
+
     def to_arrays(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """(config, arrays) as a dict and a dict of NumPy arrays: all that `from_arrays` needs."""
-        arrays = {key: value.detach().cpu().numpy() for key, value in self.state_dict().items()}
-        for key in ("scale", "origin", "covariance"):
-            arrays[f"normalizer/{key}"] = np.asarray(getattr(self.normalizer, key))
-        for i, gaussian in enumerate(self.prior or ()):  # only what is in use
-            for key in ("mean", "covariance", "noise"):
-                arrays[f"prior/{i}/{key}"] = np.asarray(getattr(gaussian, key))
-        return asdict(self.config), arrays
+        state = self.state_dict()
+        extra = state.pop("_extra_state")
+        return asdict(self.config), {key: value.detach().cpu().numpy() for key, value in (state | extra).items()}
 
     @classmethod
     def from_arrays(cls, config: Mapping[str, Any], arrays: Mapping[str, Any]) -> DeepNRSfM:
@@ -355,14 +369,8 @@ class DeepNRSfM(nn.Module):
         try:
             net = cls(Config(**config), generator=torch.Generator())
             tensors = {key: torch.as_tensor(value) for key, value in arrays.items()}
-            own = {key: value for key, value in tensors.items() if "/" not in key}
-            net.to(own["gamma"].dtype).load_state_dict(own)
-            found: dict[str, Any] = {key: tensors[f"normalizer/{key}"] for key in ("scale", "origin", "covariance")}
-            settings = {key: getattr(net.config, key) for key in ("projection", "fill", "translation")}
-            net.normalizer = Normalizer(**settings, **found | {"scale": float(found["scale"])})
-            n = len({key.split("/")[1] for key in tensors if key.startswith("prior/")})
-            parts = [{key: tensors[f"prior/{i}/{key}"] for key in ("mean", "covariance", "noise")} for i in range(n)]
-            net.prior = tuple(Gaussian(p["mean"], p["covariance"], float(p["noise"])) for p in parts) or None
+            extra = {key: tensors.pop(key) for key in list(tensors) if "/" in key}
+            net.to(tensors["gamma"].dtype).load_state_dict(tensors | {"_extra_state": extra})
         except (KeyError, TypeError, RuntimeError, ValueError):
             raise ValueError("the network in it is incomplete or of another version.") from None
         return net.eval()

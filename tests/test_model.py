@@ -338,3 +338,13 @@ def test_settings_are_not_cut():
     assert nl.Config(31.0).n_points == 31
     with pytest.raises(ValueError, match="translation='no'; expected True or False"):
         nl.Config(31, translation="no")
+
+
+def test_a_state_dict_is_the_whole_network():
+    net = nl.fit(nl.datasets.make_views(nl.datasets.make_motion(60)), steps=2, progress=False)
+    other = nl.DeepNRSfM(n_points=31)
+    other.load_state_dict(net.state_dict())
+    assert other.normalizer.scale == net.normalizer.scale and len(other.prior) == len(net.prior)
+    W = torch.randn(4, 31, 2, generator=torch.Generator().manual_seed(0))
+    for a, b in zip(other(W), net(W), strict=True):
+        assert torch.equal(a, b)

@@ -42,7 +42,7 @@ def measure(kind: str, rates: float, batch: int, depth: int) -> dict[str, object
     except (ValueError, FloatingPointError) as refused:
         return {"outcome": str(refused), "refined": float("nan")}
     finite = all(np.isfinite(a).all() for a in (rec.shapes, rec.cameras, rec.translations))
-    finite = finite and all(bool(p.isfinite().all()) for p in net.state_dict().values())
+    finite = finite and all(np.isfinite(a).all() for a in net.to_arrays()[1].values())
     error = float(metrics.normalized_error(rec.shapes, data.points3d).mean()) if finite else float("nan")
     return {"outcome": "finite" if finite else "not finite", "refined": error}
 
