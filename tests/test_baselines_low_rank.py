@@ -171,6 +171,26 @@ def test_too_large_is_refused_beforehand():
         riks(np.random.default_rng(0).normal(size=(20_000, 40, 2)), basis=1.0)
 
 
+@pytest.mark.parametrize(
+    ("folder", "limit", "usage"),
+    [(".", "memory.max", "memory.current"), ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes")],
+)
+def test_inside_a_container_only_what_it_has_left_is_free(tmp_path, monkeypatch, folder, limit, usage):
+    monkeypatch.setattr(limits, "_CGROUP", tmp_path, raising=False)
+    outside = limits._free_bytes()  # no such files
+    assert outside > 2**27
+    folder = tmp_path / folder
+    folder.mkdir(exist_ok=True)
+    (folder / limit).write_text(f"{2**27}\n")
+    (folder / usage).write_text(f"{2**27 - 3000}\n")
+    (folder / "memory.stat").write_text("anon 5\ninactive_file 1000\n")
+    assert limits._free_bytes() == 4000
+    with pytest.raises(ValueError, match=r"bmm would need about 1.0 GB of memory for 9 frames, and 0.0 GB are free"):
+        limits.check_cost("bmm", 9, 1)
+    (folder / limit).write_text("max\n")
+    assert limits._free_bytes() > 2**27
+
+
 def test_signs_of_frames_in_no_order(rng):
     S = np.repeat(rng.normal(size=(1, 20, 3)), 50, axis=0) + 0.1 * rng.normal(size=(50, 20, 3))
     M = nl.cameras.random_cameras(50, seed=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -14,6 +15,11 @@ from ... import checks
 
 Thing = TypeVar("Thing")
 
+_CGROUP = Path("/sys/fs/cgroup")
+_CONTAINER = (  # per version of Linux' control groups: folder, limit, usage
+    ("", "memory.max", "memory.current"),
+    ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
+)
 _SHARE = 0.8  # of the free memory that a method may take
 LONG = 3600  # seconds that nobody is made to wait unasked
 
@@ -105,9 +111,16 @@ def choose_components(name: str, share: Any, rank: int, frames: int) -> int:
 
 
 def _free_bytes() -> float:
-    """Memory that is free, inside a container also by its own limit."""
-    free = psutil.virtual_memory().available
+    """Memory that is free, inside a container also of its own share."""
+    return min(psutil.virtual_memory().available, *(_free_in(*files) for files in _CONTAINER))
+
+
+def _free_in(folder: str, limit: str, usage: str) -> float:
+    folder = _CGROUP / folder
     try:
-        return min(free, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+        free = int((folder / limit).read_text()) - int((folder / usage).read_text())
+        statistics = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        # Copies of files in memory count as used, but are given up as soon as somebody needs the room.
+        return max(free + int(statistics.get("inactive_file", 0)), 0)
     except (OSError, ValueError):  # no container, or one without a limit
-        return free
+        return math.inf
