@@ -123,6 +123,33 @@ def test_own_parameters_out_of_range(video):
         ((name, value),) = wrong.items()
         with pytest.raises(ValueError, match=f"{name}={value!r}; expected"):
             method(video, **wrong, progress=False)
+    for method in METHODS:
+        with pytest.raises(ValueError, match="progress='no'; expected True or False"):
+            method(video, rank=2, progress="no")
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong"),
+    [
+        (nl.baselines.nlo, {"rank": True}),
+        (nl.baselines.nlo, {"prior": "little"}),
+        (nl.baselines.sps, {"active": True}),
+        (nl.baselines.sfc, {"upgrade": "no"}),
+        (nl.baselines.sfc, {"penalty": np.nan}),
+        (nl.baselines.cns, {"locality": "here"}),
+        (nl.baselines.bmm, {"max_seconds": "a minute"}),
+        (nl.baselines.pta, {"rank": 2.5}),
+    ],
+)
+def test_nothing_is_taken_for_a_number_that_is_none(video, method, wrong):
+    ((name, value),) = wrong.items()
+    with pytest.raises(ValueError, match=f"{name}={value!r}; expected"):
+        method(video, **wrong, progress=False)
+
+
+def test_a_float_that_is_whole_will_do(video):
+    own = {"smoothness": np.float32(0.1), "dimensions": np.int64(1), "progress": np.False_}
+    np.testing.assert_array_equal(ksta(video, rank=2.0, **own).shapes, ksta(video, rank=2, **own).shapes)
 
 
 def test_fewer_points_take_a_smaller_rank(rng):

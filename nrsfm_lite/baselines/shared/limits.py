@@ -40,7 +40,7 @@ class Watch:
 
     def __init__(self, method: str, max_seconds: float | None = None, progress: bool = True) -> None:
         if max_seconds is not None:
-            checks.at_least("max_seconds", max_seconds, above=True)
+            max_seconds = checks.at_least("max_seconds", max_seconds, above=True)
         self.method, self.progress = method, checks.truth("progress", progress)
         self.end = None if max_seconds is None else time.monotonic() + max_seconds
 
@@ -105,9 +105,10 @@ def choose_rank(rank: Any, usual: int, least: int, frames: int, points: int) -> 
 
 def choose_components(name: str, share: Any, rank: int, frames: int) -> int:
     """How many basis functions of the frames a share of them is; at least the rank."""
-    if checks.at_least(name, share, above=True) > 1:
+    number = checks.at_least(name, share, above=True)
+    if number > 1:
         raise ValueError(f"{name}={share!r}; expected a share of the frames, above 0 and at most 1.")
-    return max(rank, round(share * frames))
+    return max(rank, round(number * frames))
 
 
 def _free_bytes() -> float:
