@@ -141,6 +141,51 @@ def test_pta_on_the_classic_sequences(real_data, name, rank, classical, per_fram
     assert nl.metrics.normalized_error(rec.shapes, truth["S"], scale=False).mean() == pytest.approx(per_frame, abs=2e-4)
 
 
+DOUBT = {  # what the methods are told for a mild deformation
+    "bmm": {"rank": 2, "restarts": 2},
+    "cns": {"groups_per_point": 2},
+    "ksta": {"rank": 2},
+    "nlo": {"rank": 2},
+    "pta": {"rank": 4},
+    "riks": {"rank": 2},
+    "sfc": {"rank": 1, "upgrade": True},
+    "sps": {"atoms": 1, "active": 1, "restarts": 1},
+}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_points_of_low_confidence_hardly_count(name, rng):
+    """A tenth of the points are wrong: doubting them is nearly as good as hiding them."""
+    frames, points = 60, 20
+    deformation = 0.15 * np.sin(np.linspace(0, 5, frames))[:, None, None]
+    S = rng.normal(size=(points, 3)) + deformation * rng.normal(size=(points, 3))
+    data = nl.Landmarks(points3d=S, points2d=S @ smooth_motion(rng, frames=frames).cameras)
+    wrong = rng.random((frames, points)) < 0.1
+    W = data.points2d + wrong[..., None] * rng.normal(size=(frames, points, 2))
+
+    def error(**given):
+        method = getattr(nl.baselines, name)
+        rec = method(nl.Landmarks(W, **given), **DOUBT.get(name, {}), progress=False)
+        return nl.metrics.normalized_error(rec.shapes, S).mean()
+
+    doubted, trusted = error(confidence=np.where(wrong, 1e-3, 1.0)), error()
+    hidden = error(visible=~wrong)
+    assert abs(doubted - hidden) < 0.1 * (trusted - hidden)
+
+
+def test_completion_moves_doubtful_points_towards_their_likely_places(rigid, rng):
+    wrong = rng.random((30, 9)) < 0.2
+    wrong[:, :4] = False
+    W = rigid.points2d + 100 + wrong[..., None] * rng.normal(size=(30, 9, 2))
+
+    def off(confidence):
+        filled = complete(W, confidence=np.where(wrong, confidence, 0.8))
+        np.testing.assert_array_equal(filled[~wrong], W[~wrong])  # the most trusted of a frame stay
+        return np.linalg.norm((filled - 100 - rigid.points2d)[wrong])
+
+    assert off(0.8) > off(0.1) > 100 * off(1e-3)
+
+
 def test_pta_refuses(rng):
     data = smooth_motion(rng, frames=30)
     with pytest.raises(ValueError, match="rank=30"):

@@ -41,13 +41,17 @@ def test_groups_of_few_points_are_all_there_are(rng):
 
 
 def test_groups_are_local(rng):
-    X = np.repeat(rng.normal(size=(1, 40, 2)), 50, axis=0)
+    """Four clusters of ten points: with locality a group stays in one of them, without it is nearly never in one."""
+    corners = np.repeat([[0, 0], [4, 0], [0, 4], [4, 4]], 10, axis=0)
+    X = corners + 0.3 * rng.normal(size=(50, 40, 2))
     X -= X.mean(1, keepdims=True)
 
-    def spread(locality):
-        return np.mean([X[0, group].var(0).sum() for group in sample_groups(X, 6, 5, locality, rng)])
+    def in_one_cluster(locality):
+        groups = sample_groups(X, 6, 5, locality, rng)
+        return (groups // 10 == groups[:, :1] // 10).all(1).mean()
 
-    assert spread(1.0) < 0.5 * spread(0.0)
+    assert in_one_cluster(1.0) == 1
+    assert in_one_cluster(0.0) < 0.1
 
 
 def test_nearest_factor(rng):

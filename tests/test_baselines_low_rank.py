@@ -90,8 +90,9 @@ def test_a_fifth_missing_on_a_smooth_sequence(video, rng, method, own):
     W = np.where(visible[..., None], 7 * video.points2d + (100, -40), np.nan)
     rec = method(W, visible, **own)
     complete = nl.metrics.normalized_error(method(video, **own).shapes, video.points3d).mean()
-    assert nl.metrics.normalized_error(rec.shapes, video.points3d).mean() < complete + 0.05
-    assert np.abs(rec.translations - (100, -40)).max() < 7  # in the user's units
+    assert nl.metrics.normalized_error(rec.shapes, video.points3d).mean() - complete < 0.05
+    centroids = (7 * video.points2d + (100, -40)).mean(1)  # in the user's units
+    np.testing.assert_allclose(rec.translations, centroids, atol=0.5)
     np.testing.assert_array_equal(rec.visible, visible)
 
 
@@ -122,6 +123,33 @@ def test_own_parameters_out_of_range(video):
         ((name, value),) = wrong.items()
         with pytest.raises(ValueError, match=f"{name}={value!r}; expected"):
             method(video, **wrong, progress=False)
+    for method in METHODS:
+        with pytest.raises(ValueError, match="progress='no'; expected True or False"):
+            method(video, rank=2, progress="no")
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong"),
+    [
+        (nl.baselines.nlo, {"rank": True}),
+        (nl.baselines.nlo, {"prior": "little"}),
+        (nl.baselines.sps, {"active": True}),
+        (nl.baselines.sfc, {"upgrade": "no"}),
+        (nl.baselines.sfc, {"penalty": np.nan}),
+        (nl.baselines.cns, {"locality": "here"}),
+        (nl.baselines.bmm, {"max_seconds": "a minute"}),
+        (nl.baselines.pta, {"rank": 2.5}),
+    ],
+)
+def test_nothing_is_taken_for_a_number_that_is_none(video, method, wrong):
+    ((name, value),) = wrong.items()
+    with pytest.raises(ValueError, match=f"{name}={value!r}; expected"):
+        method(video, **wrong, progress=False)
+
+
+def test_a_float_that_is_whole_will_do(video):
+    own = {"smoothness": np.float32(0.1), "dimensions": np.int64(1), "progress": np.False_}
+    np.testing.assert_array_equal(ksta(video, rank=2.0, **own).shapes, ksta(video, rank=2, **own).shapes)
 
 
 def test_fewer_points_take_a_smaller_rank(rng):
@@ -168,6 +196,26 @@ def test_too_large_is_refused_beforehand():
     limits.check_cost("bmm", 9, 0, 7200, max_seconds=60)
     with pytest.raises(ValueError, match=r"riks would (need|take up to) about"):
         riks(np.random.default_rng(0).normal(size=(20_000, 40, 2)), basis=1.0)
+
+
+@pytest.mark.parametrize(
+    ("folder", "limit", "usage"),
+    [(".", "memory.max", "memory.current"), ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes")],
+)
+def test_inside_a_container_only_what_it_has_left_is_free(tmp_path, monkeypatch, folder, limit, usage):
+    monkeypatch.setattr(limits, "_CGROUP", tmp_path, raising=False)
+    outside = limits._free_bytes()  # no such files
+    assert outside > 2**27
+    folder = tmp_path / folder
+    folder.mkdir(exist_ok=True)
+    (folder / limit).write_text(f"{2**27}\n")
+    (folder / usage).write_text(f"{2**27 - 3000}\n")
+    (folder / "memory.stat").write_text("anon 5\ninactive_file 1000\n")
+    assert limits._free_bytes() == 4000
+    with pytest.raises(ValueError, match=r"bmm would need about 1.0 GB of memory for 9 frames, and 0.0 GB are free"):
+        limits.check_cost("bmm", 9, 1)
+    (folder / limit).write_text("max\n")
+    assert limits._free_bytes() > 2**27
 
 
 def test_signs_of_frames_in_no_order(rng):

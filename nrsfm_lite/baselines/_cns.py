@@ -260,18 +260,18 @@ def _least_absolute(
     A: sparse.csr_array, At: sparse.csr_array, y: np.ndarray, x: np.ndarray, slope: float
 ) -> np.ndarray:
     """x that minimises ‖y − A x‖₁ column by column, from the least-squares solution."""
-    rest = y - A @ x
+    residual = y - A @ x
     # While the penalty is small, nothing is an outlier, x stays the least-squares solution, and the multipliers L
-    # settle at rest / (_GROWTH − 1). So begin where the largest reaches the bound, 1 / penalty.
-    L = rest / (_GROWTH - 1)
-    bound = np.abs(rest + L).max(0)
+    # settle at residual / (_GROWTH − 1). So begin where the largest reaches the bound, 1 / penalty.
+    L = residual / (_GROWTH - 1)
+    bound = np.abs(residual + L).max(0)
     for step in range(_STEPS):
-        inside = np.minimum(np.maximum(rest + L, -bound), bound)  # the part of rest + L that is not an outlier
+        inside = np.minimum(np.maximum(residual + L, -bound), bound)  # the part of residual + L that is not an outlier
         move = At @ inside / slope
         x += move
         change = A @ move
-        rest -= change
-        new = inside - change  # the new multipliers: L + rest − outliers
+        residual -= change
+        new = inside - change  # the new multipliers: L + residual − outliers
         if step % 10 == 0 and (np.square(new - L).sum(0) <= _GAP).all():
             break
         L, bound = new / _GROWTH, bound / _GROWTH

@@ -79,7 +79,8 @@ def sfc(
     penalty : float
         Theirs; 0.01 to 0.1 by category, 0.05 for most.
     restarts : int
-        How many random dictionaries to begin with; the result of lowest objective counts. Ours.
+        How many random dictionaries to begin with. The result of lowest objective counts, converged or not, and
+        ``converged`` is its own. Ours.
     upgrade : bool
         For rank 1: at the end refit codes and atom without penalty, in turns, and change the atom's frame of axes
         such that the codes come as near to scaled cameras as they can. Exact on rigid objects, also with points
@@ -129,7 +130,7 @@ def sfc(
     rng = np.random.default_rng(seed)
     for _ in range(restarts):
         state, value, done = _descend(_start(F, P, rank, rng), X, weight, penalty, watch)
-        if best is None or (value < best_value and done):
+        if best is None or value < best_value:
             best, best_value, converged = state, value, done
         if watch.over:
             break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -14,6 +15,11 @@ from ... import checks
 
 Thing = TypeVar("Thing")
 
+_CGROUP = Path("/sys/fs/cgroup")
+_CONTAINER = (  # per version of Linux' control groups: folder, limit, usage
+    ("", "memory.max", "memory.current"),
+    ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes"),
+)
 _SHARE = 0.8  # of the free memory that a method may take
 LONG = 3600  # seconds that nobody is made to wait unasked
 
@@ -34,7 +40,7 @@ class Watch:
 
     def __init__(self, method: str, max_seconds: float | None = None, progress: bool = True) -> None:
         if max_seconds is not None:
-            checks.at_least("max_seconds", max_seconds, above=True)
+            max_seconds = checks.at_least("max_seconds", max_seconds, above=True)
         self.method, self.progress = method, checks.truth("progress", progress)
         self.end = None if max_seconds is None else time.monotonic() + max_seconds
 
@@ -99,15 +105,23 @@ def choose_rank(rank: Any, usual: int, least: int, frames: int, points: int) -> 
 
 def choose_components(name: str, share: Any, rank: int, frames: int) -> int:
     """How many basis functions of the frames a share of them is; at least the rank."""
-    if checks.at_least(name, share, above=True) > 1:
+    number = checks.at_least(name, share, above=True)
+    if number > 1:
         raise ValueError(f"{name}={share!r}; expected a share of the frames, above 0 and at most 1.")
-    return max(rank, round(share * frames))
+    return max(rank, round(number * frames))
 
 
 def _free_bytes() -> float:
-    """Memory that is free, inside a container also by its own limit."""
-    free = psutil.virtual_memory().available
+    """Memory that is free, inside a container also of its own share."""
+    return min(psutil.virtual_memory().available, *(_free_in(*files) for files in _CONTAINER))
+
+
+def _free_in(folder: str, limit: str, usage: str) -> float:
+    folder = _CGROUP / folder
     try:
-        return min(free, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+        free = int((folder / limit).read_text()) - int((folder / usage).read_text())
+        statistics = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines())
+        # Copies of files in memory count as used, but are given up as soon as somebody needs the room.
+        return max(free + int(statistics.get("inactive_file", 0)), 0)
     except (OSError, ValueError):  # no container, or one without a limit
-        return free
+        return math.inf

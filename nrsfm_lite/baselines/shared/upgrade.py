@@ -63,7 +63,8 @@ def trajectory_cameras(X: np.ndarray, watch: Watch) -> np.ndarray:
 
     The centred images stacked (2F, P) are factored by singular value decomposition. Three columns Q
     of the upgrade are found such that each frame's two rows become orthonormal: first on the 6
-    strongest components, then on 3 more at a time, each from the last result, until nothing improves.
+    strongest components, then on 3 more at a time, each from the last result, until nothing improves. Damped
+    Gauss-Newton steps polish the last one.
     Deterministic; a good minimum needs cameras that move smoothly, and exact cameras a rigid part of the shape:
     a combination of the coefficients that is constant over the frames.
 
