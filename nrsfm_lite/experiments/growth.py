@@ -3,7 +3,7 @@
 import time
 
 from .. import baselines, datasets, metrics
-from ..baselines.shared.limits import TooLarge
+from ..baselines.shared import limits
 from .lab.process import apart, peak_mb
 
 QUESTION = "How do time and memory of the classical methods grow with the number of frames?"
@@ -48,11 +48,11 @@ def _reconstruct(data, method):
     views = datasets.make_views(datasets.load(data))
     how = {} if method in ("tomasi_kanade", "pta") else {"progress": False}
     baselines.tomasi_kanade(views[:20])  # libraries load on first use
-    baselines.limits.LONG = _LONG  # in this process only
+    limits.LONG = _LONG  # in this process only
     before, start = peak_mb(), time.perf_counter()
     try:
         rec = getattr(baselines, method)(views, **how)
-    except TooLarge as refusal:
+    except limits.TooLarge as refusal:
         return {"method_seconds": "", "work_mb": "", "per_frame": "", "outcome": f"refused: {refusal}"}
     seconds = time.perf_counter() - start
     return {
