@@ -326,8 +326,6 @@ def read_npz(path: str | Path, keys: Collection[str] | None = None) -> dict[str,
         raise ValueError(f"{path}: could not be read as .npz ({error}).") from None
 
 
-
-
 def _names_and_edges(names: Any, edges: Any, n_points: int) -> tuple[tuple[str, ...], np.ndarray]:
     names = () if names is None else tuple(str(n) for n in names)
     names = names or tuple(f"point_{i}" for i in range(n_points))
