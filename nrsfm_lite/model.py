@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from . import normalizer, weights
 from .cameras import nearest_orthonormal
-from .checks import one_of, truth, whole
+from .checks import check_shape, one_of, truth, whole
 from .normalizer import Normalizer
 from .shape_prior import Gaussian, Prior
 from .sparse_coding import mutual_coherence
@@ -262,14 +262,15 @@ class DeepNRSfM(nn.Module):
         """`Normalizer.normalize` of image points as they are, (B, P, 2), with weights (B, P): image, X and unit."""
         return self.normalizer.normalize(*normalizer.center(W, weight), weight)
 
-    def forward(self, W: Any, visible: Any = None) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, W: Any, visible: Any = None, confidence: Any = None) -> tuple[Tensor, Tensor, Tensor]:
         """Shapes, cameras and translations of image points.
 
         Parameters
         ----------
         W : (B, P, 2) tensor or array in image coordinates; hidden points may be NaN
-        visible : (B, P) tensor or array, optional
-            Bool, or weights from 0 to 1.
+        visible : (B, P) bool tensor or array, optional
+        confidence : (B, P), optional
+            From 0 to 1, how far to trust a visible point; 0 hides it.
 
         Returns
         -------
@@ -279,9 +280,9 @@ class DeepNRSfM(nn.Module):
         Raises
         ------
         ValueError
-            For arrays of wrong shape, or visible points that are not finite.
+            For arrays of wrong shape or range, or visible points that are not finite.
         """
-        W, weight = (W, visible) if torch.compiler.is_exporting() else self._parse(W, visible)
+        W, weight = (W, visible) if torch.compiler.is_exporting() else self._parse(W, visible, confidence)
         X, mean = normalizer.center(W.double(), weight)
         image, _, unit = self.normalizer.normalize(X, mean, weight)
         _, S, M = self.lift(image)
@@ -290,18 +291,23 @@ class DeepNRSfM(nn.Module):
         t = mean + normalizer.weighted_mean(X - S @ M, weight)  # the best t in closed form
         return S.to(W.dtype), M.to(W.dtype), t.to(W.dtype)
 
-    def _parse(self, W: Any, visible: Any) -> tuple[Tensor, Tensor]:
-        """W and the points' weights as tensors where the network is."""
+    def _parse(self, W: Any, visible: Any, confidence: Any) -> tuple[Tensor, Tensor]:
+        """W and the points' weights as tensors where the network is; unlike `images.parse`, gradients pass through."""
         W = torch.as_tensor(W, device=self.device)
         W = W if W.is_floating_point() else W.double()
         P = self.config.n_points
         if W.ndim != 3 or tuple(W.shape[1:]) != (P, 2):
             raise ValueError(f"W has shape {tuple(W.shape)}; expected (B, {P}, 2), as the network has {P} points.")
-        if visible is None:
-            visible = torch.ones(W.shape[:2], dtype=torch.bool)
-        weight = torch.as_tensor(visible, device=self.device)
-        if weight.shape != W.shape[:2]:
-            raise ValueError(f"visible has shape {tuple(weight.shape)}; expected {tuple(W.shape[:2])}.")
+        weight = torch.ones(W.shape[:2], dtype=torch.bool, device=self.device)
+        for name, given in [("visible", visible), ("confidence", confidence)]:
+            if given is not None:
+                given = torch.as_tensor(given, device=self.device)
+                check_shape(name, given, tuple(W.shape[:2]))
+                allowed = (given == 0) | (given == 1) if name == "visible" else (given >= 0) & (given <= 1)
+                if not allowed.all():
+                    expected = "truth values; weights are given as confidence" if name == "visible" else "0 to 1"
+                    raise ValueError(f"{name} holds {given[~allowed][0].item():g}; expected {expected}.")
+                weight = weight * given
         if not torch.isfinite(W).all(2)[weight > 0].all():
             raise ValueError("W has visible points that are NaN or infinite; mark missing points as False in visible.")
         return W, weight

@@ -236,9 +236,15 @@ def test_a_hidden_point_does_not_matter_and_a_weight_of_zero_hides(net, W):
     visible = torch.ones(W.shape[:2], dtype=torch.bool)
     visible[:, 1] = False
     other = torch.where(visible[..., None], W, 1e6)
-    for a, b, c in zip(net(W, visible), net(other, visible), net(other, visible.float()), strict=True):
-        assert torch.equal(a, b)
-        torch.testing.assert_close(a, c)
+    results = [
+        net(W, visible),
+        net(other, visible),
+        net(other, visible.float()),
+        net(other, confidence=visible.double()),
+    ]
+    for a, *same in zip(*results, strict=True):
+        for b in same:
+            torch.testing.assert_close(a, b)
 
 
 def test_save_and_load(net, W, tmp_path):
@@ -298,6 +304,10 @@ def test_what_the_network_cannot_take_is_said(net, W):
         net(W, torch.ones(6, 4))
     with pytest.raises(ValueError, match="visible points that are NaN"):
         net(torch.full_like(W, torch.nan))
+    with pytest.raises(ValueError, match=r"visible holds 0\.5; expected truth values; weights are given as confidence"):
+        net(W, torch.full((6, 5), 0.5))
+    with pytest.raises(ValueError, match="confidence holds 2; expected 0 to 1"):
+        net(W, confidence=torch.full((6, 5), 2.0))
 
 
 def test_only_the_part_of_a_prior_that_is_in_use_is_kept(tmp_path):

@@ -19,6 +19,8 @@ _GROWTH = 1.1  # of both weights, per iteration
 _LARGEST = 1e5
 _ITERATIONS = 300
 _TOLERANCE = 3e-6  # relative change of the objective
+_REFITS, _SETTLED = 1000, 1e-6  # rounds of the upgrade, and the relative change of the misfit at which it rests
+_RIDGE = 1e-12  # keeps a frame of few visible points solvable
 _AGREEMENT = 1e-3  # of M and Z, relative: before, the objective may rest while all codes are still zero
 
 
@@ -79,9 +81,9 @@ def sfc(
     restarts : int
         How many random dictionaries to begin with; the result of lowest objective counts. Ours.
     upgrade : bool
-        For rank 1: at the end refit the codes without penalty, and change the atom's frame of axes such that they
-        come as near to scaled cameras as they can. Exact on rigid objects, a little less so with points missing,
-        bad on what deforms much. Ours.
+        For rank 1: at the end refit codes and atom without penalty, in turns, and change the atom's frame of axes
+        such that the codes come as near to scaled cameras as they can. Exact on rigid objects, also with points
+        missing; bad on what deforms much. Ours.
     max_seconds : float, optional
         For all restarts together; then the result so far is returned, with ``converged=False``. During the first
         third of the iterations it is of little use.
@@ -132,7 +134,7 @@ def sfc(
         if watch.over:
             break
     if upgrade:
-        _upgrade(best, X, weight)
+        converged &= _upgrade(best, X, weight, watch)
     S = _shapes(best) * size
     M = np.repeat(np.eye(3, 2)[None], F, axis=0)
     return images.reconstruction(S, M, (best.t * size)[..., 0], method="sfc", converged=converged)
@@ -271,13 +273,26 @@ def _shapes(s: _State) -> np.ndarray:
     return (np.stack([x, y, z], 1).reshape(F, 3, 3 * K) @ s.A).swapaxes(1, 2)
 
 
-def _upgrade(s: _State, X: np.ndarray, weight: np.ndarray) -> None:
-    """Refit the codes of one atom, and change its axes, M_f G and G⁻¹ B, such that they come near scaled cameras."""
-    s.Z = _codes(s.A, (X - s.t) * weight, weight, np.zeros_like(s.Z), 1e-12)
-    s.t = _shift(X - s.Z @ s.A, weight)
+def _upgrade(s: _State, X: np.ndarray, weight: np.ndarray, watch: Watch) -> bool:
+    """Refit one atom and its codes, and change its axes, M_f G and G⁻¹ B, such that they come near scaled cameras.
+
+    Changes the state, and returns whether the refits came to rest.
+    """
+    before, settled = np.inf, False
+    for k in watch.steps(_REFITS, "upgrade"):
+        if k:
+            s.A = _unit(_atoms(s.Z, (X - s.t) * weight, weight, np.zeros_like(s.A), _RIDGE))
+        s.Z = _codes(s.A, (X - s.t) * weight, weight, np.zeros_like(s.Z), _RIDGE)
+        s.t = _shift(X - s.Z @ s.A, weight)
+        misfit = np.sqrt((weight * (X - s.t - s.Z @ s.A) ** 2).sum())
+        settled = before - misfit <= _SETTLED * misfit
+        if settled:
+            break
+        before = misfit
     Q = metric_gram(s.Z / np.sqrt((s.Z**2).sum((1, 2), keepdims=True)), one_scale=False)
     values, vectors = np.linalg.eigh(Q * np.sign(np.trace(Q)))
     if values[0] <= 1e-6 * values[2]:
         raise ValueError("upgrade=True, but no rigid object comes near these images; expected upgrade=False for them.")
     G = vectors * np.sqrt(values)
     s.Z, s.A = s.Z @ G, np.linalg.solve(G, s.A)
+    return settled

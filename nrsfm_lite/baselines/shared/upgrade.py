@@ -9,7 +9,10 @@ import torch
 from scipy.optimize import minimize
 
 from ...cameras import nearest_orthonormal
+from .descent import Propose, levenberg_marquardt
 from .limits import Watch
+
+_SETTLED = 1e-6  # relative change of the cameras' misfit at which a minimum is reached
 
 
 def stacked(X: np.ndarray) -> np.ndarray:
@@ -96,8 +99,35 @@ def trajectory_cameras(X: np.ndarray, watch: Watch) -> np.ndarray:
         if not found.fun < best:
             break
         Q, best, kept = found.x.reshape(size, 3), found.fun, size
-    rows = motion[:, :, :kept] @ Q[:kept]  # (F, 2, 3)
+    rows = motion[:, :, :kept] @ _polished(Q[:kept], motion[:, :, :kept], watch)  # (F, 2, 3)
     return continuous(rows).transpose(0, 2, 1)
+
+
+def _polished(Q: np.ndarray, motion: np.ndarray, watch: Watch) -> np.ndarray:
+    """The same minimum to more digits: where some directions hardly matter, quasi-Newton steps end too early."""
+
+    def evaluate(Q: np.ndarray) -> tuple[np.ndarray, float]:
+        return Q, _misfit(Q.ravel(), motion)[0]
+
+    def linearise(Q: np.ndarray) -> Propose:
+        x, y = motion[:, 0], motion[:, 1]  # (F, n)
+        Qx, Qy = x @ Q, y @ Q  # (F, 3)
+        residual = np.concatenate([(Qx**2).sum(1) - 1, (Qy**2).sum(1) - 1, (Qx * Qy).sum(1)])
+        by_Q = [2 * x[:, :, None] * Qx[:, None], 2 * y[:, :, None] * Qy[:, None]]
+        by_Q.append(x[:, :, None] * Qy[:, None] + y[:, :, None] * Qx[:, None])
+        J = np.concatenate(by_Q).reshape(len(residual), -1)
+        U, s, Vh = np.linalg.svd(J, full_matrices=False)  # not JᵀJ, which would halve the digits
+        along = U.T @ residual
+
+        def propose(damping: float) -> tuple[np.ndarray, float]:
+            return evaluate(Q - (Vh.T @ (s / (s**2 + damping * s[0] ** 2) * along)).reshape(Q.shape))
+
+        return propose
+
+    def settled(before: float, after: float) -> bool:
+        return before - after <= _SETTLED * after
+
+    return levenberg_marquardt(*evaluate(Q), linearise, settled, watch, "cameras", damping=1e-6, easing=10.0)[0]
 
 
 def _misfit(q: np.ndarray, motion: np.ndarray) -> tuple[float, np.ndarray]:

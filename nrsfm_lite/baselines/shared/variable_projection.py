@@ -20,6 +20,7 @@ from .upgrade import stacked
 
 _RCOND = 1e-10  # kernels can make columns of C nearly dependent
 _DAMPING, _EASING = 1e-4, 100.0
+_SMALL = 2e-3  # a root mean square of which less is expected on images without noise and from the model alone
 
 
 @dataclass(eq=False)
@@ -93,7 +94,8 @@ def fit(
         Find the atoms one after the other, each from what the others left, instead of all at once.
     canonical : function, theta -> theta, optional
         Applied after a step; it may change the parameters in ways that do not change the residual.
-    iterations, tolerance : at most so many steps, until the root mean square changes by less
+    iterations, tolerance : at most so many steps, until the root mean square changes by less; for images of unit scale
+        Once the root mean square itself is small, as on exact data, the change must be smaller by its square.
 
     Returns
     -------
@@ -124,7 +126,7 @@ def fit(
     state, _, converged = levenberg_marquardt(
         *evaluate(theta),
         linearise,
-        lambda before, after: before - after <= tolerance,
+        lambda before, after: before - after <= tolerance * min(1, (after / _SMALL) ** 2),
         watch,
         "coefficients",
         damping=_DAMPING,
