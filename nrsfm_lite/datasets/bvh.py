@@ -145,7 +145,9 @@ def _files(path):
 def _hierarchy(file, lines):
     """Names, parents, offsets (J, 3), channel names per joint, and the line where MOTION stands."""
     tokens = [(token, n) for n, line in enumerate(lines, 1) for token in line.split()]
-    labels, parents, offsets, channels, stack = [], [], [], [], []  # an end site has no label
+    labels, parents, offsets = [], [], []  # an end site has no label
+    channels: list[tuple[str, ...]] = []
+    stack: list[int] = []
     position = 0
 
     def fail(message, n=None):
@@ -213,7 +215,8 @@ def _hierarchy(file, lines):
 
 def _unique_names(labels, parents):
     """A name for every joint and end site; a label that stands in the file belongs to the first joint that has it."""
-    taken, used, names = {label for label in labels if label is not None}, {}, list(labels)
+    taken, names = {label for label in labels if label is not None}, list(labels)
+    used: dict[str, int] = {}
 
     def name(label):
         used[label] = number = used.get(label, 0) + 1

@@ -43,7 +43,7 @@ _SIDE = {
 
 
 def _skeleton():
-    bones = dict(_TRUNK)
+    bones: dict[str, tuple[str, tuple[float, float, float]]] = dict(_TRUNK)
     for side, sign in (("left_", 1), ("right_", -1)):
         for joint, (parent, (x, y, z)) in _SIDE.items():
             bones[side + joint] = (side + parent if parent in _SIDE else parent, (sign * x, y, z))

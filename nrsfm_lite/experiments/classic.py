@@ -1,5 +1,7 @@
 """The classic sequences: every classical method and the network, in both conventions (chapter 02)."""
 
+from typing import Any
+
 import numpy as np
 
 from .. import baselines, cameras, datasets, metrics, quality
@@ -94,7 +96,7 @@ def report(rows: list[dict[str, str]]) -> str:
 
 def _own(method, variant, data):
     """What a method is told for a sequence, beside its defaults."""
-    own = {"rank": _RANKS[method].get(data, 7)} if method in _RANKS else {}
+    own: dict[str, Any] = {"rank": _RANKS[method].get(data, 7)} if method in _RANKS else {}
     if method == "riks":
         own |= {"kernel": variant[0] if variant else "rik", "basis": 0.1 if variant and data == "dance" else 0.2}
     if method == "sfc":

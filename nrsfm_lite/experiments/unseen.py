@@ -59,7 +59,8 @@ def report(rows: list[dict[str, str]]) -> str:
 
 def _train(views, change, steps, seed):
     """`training.train` with one change and a gradient by autograd."""
-    plan = replace(SCHEDULES["default"], steps=steps, **({"pull": 0.0} if change == _DEPTH else {}))
+    plan = replace(SCHEDULES["default"], steps=steps)
+    plan = replace(plan, pull=0.0) if change == _DEPTH else plan
     random = torch.Generator().manual_seed(seed)
     net = DeepNRSfM(Config(views.n_points), generator=random)
     images = parse(views.points2d)
@@ -145,7 +146,7 @@ def _guess(nets, change, views):
     W = torch.as_tensor(views.points2d)
     _, X, _ = nets[0].normalize(W, torch.ones(W.shape[:2], dtype=torch.bool))
     X = X.float()
-    S_sum, M_sum = 0.0, 0.0
+    S_sum = M_sum = torch.tensor(0.0)
     for net in nets:
         _, S, M = _lift(net, X, change)
         S = S - S.mean(1, keepdim=True)
