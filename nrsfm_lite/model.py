@@ -340,10 +340,12 @@ class DeepNRSfM(nn.Module):
 
     def get_extra_state(self) -> dict[str, Tensor]:
         """Normaliser and prior, of which only what is in use: with the parameters, all of `state_dict`."""
-        state = {f"normalizer/{key}": torch.as_tensor(getattr(self.normalizer, key)) for key in _FOUND}
+        state = {
+            f"normalizer/{key}": torch.as_tensor(getattr(self.normalizer, key), dtype=torch.float64) for key in _FOUND
+        }
         for i, gaussian in enumerate(self.prior or ()):
             for key in _OF_A_GAUSSIAN:
-                state[f"prior/{i}/{key}"] = torch.as_tensor(getattr(gaussian, key))
+                state[f"prior/{i}/{key}"] = torch.as_tensor(getattr(gaussian, key), dtype=torch.float64)
         return state
 
     def set_extra_state(self, state: Mapping[str, Tensor]) -> None:

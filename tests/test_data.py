@@ -128,7 +128,7 @@ def test_a_reconstruction_with_half_a_network_is_refused(rng, tmp_path):
         nl.Reconstruction.load(file)
 
 
-@pytest.mark.parametrize("part", ["scale", "gamma", "D.0", "*"])
+@pytest.mark.parametrize("part", ["normalizer/scale", "gamma", "D.0", "*"])
 def test_a_network_without_a_part_is_refused_in_words(rng, tmp_path, part):
     net = nl.DeepNRSfM(nl.Config(5, n_dictionaries=3, first_atoms=8, last_atoms=3))
     file = nl.reconstruct(rng.normal(size=(4, 5, 2)), model=net).save(tmp_path / "r")
