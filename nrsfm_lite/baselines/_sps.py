@@ -136,14 +136,15 @@ def _best(
 ) -> tuple[np.ndarray, np.ndarray, bool, int]:
     """Of the start with the lowest reprojection error S, M, and whether all went well; and the number of starts."""
     rows = X.swapaxes(1, 2).copy()
-    best, least, used = None, np.inf, 0
+    best: Any = None
+    least, used = np.inf, 0
     while used < restarts and not (used and watch.over):
         used += 1
         U, support, codes, _, settled = learn_atoms(rows, atoms, active, rng, watch, f"start {used}")
         B, cameras, definite = _upgrade(U, support, codes)
         M, B, glued = _glue(B, cameras, support, codes, definite, rng)
         S = _shapes(B, M, support, X)
-        error = np.linalg.norm(X - S @ M) / np.linalg.norm(X)
+        error = float(np.linalg.norm(X - S @ M) / np.linalg.norm(X))
         if error < least:
             best, least = (S, M, settled and glued and not watch.over), error
         if least < _GOOD:
@@ -219,7 +220,7 @@ def _glue(
 
 def _fit(
     j: int,
-    frames: tuple[np.ndarray, np.ndarray],
+    frames: tuple[np.ndarray, ...],
     cameras: np.ndarray,
     M: np.ndarray,
     known: np.ndarray,

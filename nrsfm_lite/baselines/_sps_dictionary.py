@@ -51,12 +51,12 @@ def learn_atoms(
         support, codes, residual = block_omp(U, rows, active)
         history.append(np.linalg.norm(residual) / size)
         stale = len(history) > _WARM_UP and history[-1 - _PATIENCE] - history[-1] < _SETTLED * history[-1]
-        settled = history[-1] < _EXACT or stale
+        settled = bool(history[-1] < _EXACT or stale)
         if settled:
             break
         _update_atoms(U, rows, support, codes, residual, rng)
     support, codes, residual = block_omp(U, rows, active)
-    return U, support, codes, np.linalg.norm(residual) / size, settled
+    return U, support, codes, float(np.linalg.norm(residual) / size), settled
 
 
 def convex_start(rows: np.ndarray, atoms: int, rng: np.random.Generator, watch: Watch, what: str) -> np.ndarray:
