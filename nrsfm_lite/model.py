@@ -350,8 +350,8 @@ class DeepNRSfM(nn.Module):
 
     def set_extra_state(self, state: Mapping[str, Tensor]) -> None:
         """Take over what `get_extra_state` gave."""
-        found: dict[str, Any] = {key: state[f"normalizer/{key}"] for key in _FOUND}
-        self.normalizer = replace(self.normalizer, **found | {"scale": float(found["scale"])})
+        scale, origin, covariance = (state[f"normalizer/{key}"] for key in _FOUND)
+        self.normalizer = replace(self.normalizer, scale=float(scale), origin=origin, covariance=covariance)
         n = len({key.split("/")[1] for key in state if key.startswith("prior/")})
         parts = [{key: state[f"prior/{i}/{key}"] for key in _OF_A_GAUSSIAN} for i in range(n)]
         self.prior = tuple(Gaussian(p["mean"], p["covariance"], float(p["noise"])) for p in parts) or None

@@ -63,7 +63,7 @@ def test_exact_on_a_rigid_object(rigid):
     np.testing.assert_allclose(nl.metrics.normalized_error(rec.shapes, rigid.points3d, scale=False), 0, atol=1e-9)
     np.testing.assert_allclose(nl.cameras.rotation_error(rec.cameras, rigid.cameras), 0, atol=1e-5)
     np.testing.assert_allclose(rec.projections, rigid.points2d, atol=1e-9)
-    assert nl.metrics.handedness(rec.shapes, rigid.points3d) == 0
+    assert nl.metrics.handedness(rec.shapes, rigid.points3d).mirrored == 0
     assert rec.method == "tomasi_kanade" and rec.edges.tolist() == [[0, 1]]
 
 

@@ -118,7 +118,7 @@ def test_exact_on_low_rank_shapes(rng, amount):
     data = nl.Landmarks(points3d=50 * data.points3d, points2d=50 * data.points2d + 100, edges=data.edges)
     rec = quick(data)
     assert error(rec, data).mean() < 1e-3
-    assert nl.metrics.handedness(rec.shapes, data.points3d) == 0
+    assert nl.metrics.handedness(rec.shapes, data.points3d).mirrored == 0
     np.testing.assert_allclose(rec.projections, data.points2d, rtol=1e-12)
     np.testing.assert_allclose(rec.translations, data.points2d.mean(1))
     np.testing.assert_allclose(rec.cameras - np.eye(3, 2), 0, atol=1e-12)

@@ -45,7 +45,7 @@ def test_bmm_is_exact_on_low_rank_in_any_order(rng):
     data = low_rank(rng, 0.4 * rng.normal(size=(120, 1)), nl.cameras.random_cameras(120, seed=1))
     rec = bmm(data, rank=2, progress=False)
     assert error(rec, data) < 1e-3 and rec.converged
-    assert nl.metrics.handedness(rec.shapes, data.points3d) == 0
+    assert nl.metrics.handedness(rec.shapes, data.points3d).mirrored == 0
     np.testing.assert_allclose(rec.projections, data.points2d, atol=1e-2)
     order = rng.permutation(120)
     assert error(bmm(data[order], rank=2, progress=False), data[order]) < 1e-3

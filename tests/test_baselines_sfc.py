@@ -64,7 +64,7 @@ def test_exact_on_a_rigid_object_after_the_upgrade(rng, stretch):
     data = rigid_views(rng, stretch)
     rec = sfc(data, rank=1, upgrade=True, progress=False)
     assert error(rec, data) < 1e-7
-    assert nl.metrics.handedness(rec.shapes, data.points3d) == 0
+    assert nl.metrics.handedness(rec.shapes, data.points3d).mirrored == 0
     np.testing.assert_allclose(rec.projections, data.points2d, atol=1e-6)
     np.testing.assert_allclose(rec.translations, data.translations, atol=1e-6)
 

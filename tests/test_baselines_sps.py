@@ -41,7 +41,7 @@ def test_cameras_too_where_coefficients_are_positive():
     rec = sps(data, atoms=5, progress=False)
     assert nl.cameras.rotation_error(rec.cameras, data.cameras).max() < 0.1  # degrees
     assert nl.metrics.e3d(rec.shapes, data.points3d).max() < 1e-3
-    assert nl.metrics.handedness(rec.shapes, data.points3d) == 0
+    assert nl.metrics.handedness(rec.shapes, data.points3d).mirrored == 0
 
 
 def test_exact_with_free_signs_and_more_dimensions_than_points():

@@ -115,14 +115,14 @@ def _least_nuclear_norm(X: np.ndarray, M: np.ndarray, rank: int, watch: Watch) -
         for _ in range(_ITERATIONS):
             S = ahead.reshape(F, P, 3)
             new = _shrink((S - (S @ M - X) @ M.swapaxes(1, 2)).reshape(F, 3 * P), mu)
-            change = np.linalg.norm(new - A) / max(1, float(np.linalg.norm(A)))
+            change = np.linalg.norm(new - A) / max(1.0, float(np.linalg.norm(A)))
             if ((ahead - new) * (new - A)).sum() > 0:  # the momentum points uphill: start it anew
                 momentum = 1.0
             momentum, share = nesterov(momentum)
             ahead, A = new + share * (new - A), new
             if change < _TOLERANCE or watch.over:
                 break
-        levels += int(change < _TOLERANCE)
+        levels += bool(change < _TOLERANCE)
     return _cut(A, rank).reshape(F, P, 3), levels == _LEVELS
 
 

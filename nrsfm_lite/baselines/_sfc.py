@@ -126,14 +126,18 @@ def sfc(
     size = np.sqrt((weight * X**2).sum((1, 2), keepdims=True))
     X = X / size
     watch = Watch("sfc", max_seconds, progress)
-    best, best_value, converged = None, np.inf, False
     rng = np.random.default_rng(seed)
-    for _ in range(restarts):
-        state, value, done = _descend(_start(F, P, rank, rng), X, weight, penalty, watch)
-        if best is None or value < best_value:
-            best, best_value, converged = state, value, done
+
+    def from_random_start() -> tuple[_State, float, bool]:
+        return _descend(_start(F, P, rank, rng), X, weight, penalty, watch)
+
+    best, least, converged = from_random_start()
+    for _ in range(restarts - 1):
         if watch.over:
             break
+        state, value, done = from_random_start()
+        if value < least:
+            best, least, converged = state, value, done
     if upgrade:
         converged &= _upgrade(best, X, weight, watch)
     S = _shapes(best) * size

@@ -136,7 +136,8 @@ def _best(
 ) -> tuple[np.ndarray, np.ndarray, bool, int]:
     """Of the start with the lowest reprojection error S, M, and whether all went well; and the number of starts."""
     rows = X.swapaxes(1, 2).copy()
-    best, least, used = None, np.inf, 0
+    best: Any = None
+    least, used = np.inf, 0
     while used < restarts and not (used and watch.over):
         used += 1
         U, support, codes, _, settled = learn_atoms(rows, atoms, active, rng, watch, f"start {used}")

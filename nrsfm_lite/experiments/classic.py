@@ -71,8 +71,7 @@ def measure(data: str, method: str, seed: int) -> dict[str, object]:
         unlikely = quality.negative_log_likelihood(rec.model, truth.points2d)
         return _errors(rec, truth, name) | {"one_pass": one_pass, "negative_log_likelihood": unlikely, "own": ""}
     own = _own(name, variant, data)
-    how = own | ({"seed": seed} if name in _BY_CHANCE else {})
-    how |= {} if name in ("tomasi_kanade", "pta") else {"progress": False}
+    how = own | ({"seed": seed} if name in _BY_CHANCE else {}) | {"progress": False}
     W = truth.points2d
     if name in _BY_ROUNDING:
         W = W + 1e-12 * np.random.default_rng(seed).normal(size=W.shape)

@@ -46,12 +46,11 @@ def report(rows: list[dict[str, str]]) -> str:
 
 def _reconstruct(data, method):
     views = datasets.make_views(datasets.load(data))
-    how = {} if method in ("tomasi_kanade", "pta") else {"progress": False}
-    baselines.tomasi_kanade(views[:20])  # libraries load on first use
+    baselines.tomasi_kanade(views[:20], progress=False)  # libraries load on first use
     limits.LONG = _LONG  # in this process only
     before, start = peak_mb(), time.perf_counter()
     try:
-        rec = getattr(baselines, method)(views, **how)
+        rec = getattr(baselines, method)(views, progress=False)
     except limits.TooLarge as refusal:
         return {"method_seconds": "", "work_mb": "", "per_frame": "", "outcome": f"refused: {refusal}"}
     seconds = time.perf_counter() - start

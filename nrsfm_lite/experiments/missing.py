@@ -46,7 +46,7 @@ def measure(data: str, hidden: str, method: str, seed: int) -> dict[str, object]
     names = [*(k for key in keys for k in (key, f"{key}_hidden")), "shift"]
     result: dict[str, object] = {name: "" for name in names}
     if method == "rigid":
-        return result | scoring.hidden_errors("seen", baselines.tomasi_kanade(train).shapes, train)
+        return result | scoring.hidden_errors("seen", baselines.tomasi_kanade(train, progress=False).shapes, train)
     net = fit(_complete(train), steps=scoring.quick_steps(data), seed=seed, progress=False)
     for key, frames in (("refined", train), ("refined_unseen", test)):
         S = reconstruct(_complete(frames), model=net).shapes

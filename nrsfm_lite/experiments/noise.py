@@ -34,7 +34,8 @@ def measure(data: str, noise: float, method: str, seed: int) -> dict[str, object
         net, result = scoring.train_and_score(data, seed, {"noise": noise})
         return {k: v for k, v in result.items() if not k.endswith("_hidden")} | _sparsity(net, data, noise)
     train, _ = scoring.views(data, noise=noise)
-    rec = baselines.tomasi_kanade(train) if method == "rigid" else baselines.pta(train)
+    baseline = baselines.tomasi_kanade if method == "rigid" else baselines.pta
+    rec = baseline(train, progress=False)
     keys = ("seen", "unseen", "refined", "shift", "refined_unseen", "first_threshold", "active", "found_noise")
     seen = scoring.hidden_errors("seen", rec.shapes, train)["seen"]
     return dict.fromkeys(keys, "") | {"seen": seen}

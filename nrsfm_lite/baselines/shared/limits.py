@@ -117,10 +117,10 @@ def _free_bytes() -> float:
 
 
 def _free_in(folder: str, limit: str, usage: str) -> float:
-    place = _CGROUP / folder
+    group = _CGROUP / folder
     try:
-        free = int((place / limit).read_text()) - int((place / usage).read_text())
-        statistics = dict(line.split() for line in (place / "memory.stat").read_text().splitlines())
+        free = int((group / limit).read_text()) - int((group / usage).read_text())
+        statistics = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
         # Copies of files in memory count as used, but are given up as soon as somebody needs the room.
         return max(free + int(statistics.get("inactive_file", 0)), 0)
     except (OSError, ValueError):  # no container, or one without a limit

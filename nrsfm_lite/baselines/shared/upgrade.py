@@ -170,12 +170,12 @@ def unordered_cameras(X: np.ndarray, rank: int, starts: Iterable, rng: np.random
     U, s, _ = np.linalg.svd(stacked(X), full_matrices=False)
     n = min(3 * rank, len(s))
     motion = np.ascontiguousarray((U[:, :n] * np.sqrt(s[:n])).reshape(F, 2, n))
-    best = None
+    found = []
     for _ in starts:
         first = np.linalg.qr(rng.normal(size=(n, 3)))[0]
-        found = minimize(_ratio_misfit, first.ravel(), args=(motion,), jac=True, method="BFGS", options={"gtol": 1e-8})
-        best = found if best is None or found.fun < best.fun else best
-    rows = motion @ best.x.reshape(n, 3)  # (F, 2, 3)
+        how = {"method": "BFGS", "options": {"gtol": 1e-8}}
+        found.append(minimize(_ratio_misfit, first.ravel(), args=(motion,), jac=True, **how))
+    rows = motion @ min(found, key=lambda result: result.fun).x.reshape(n, 3)  # (F, 2, 3)
     return consistent(orthonormal(rows.transpose(0, 2, 1)), X)
 
 
