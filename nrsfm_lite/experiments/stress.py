@@ -12,6 +12,7 @@ from ..training import fit
 from .lab import scoring
 
 QUESTION = "Does any learning rate, batch, depth or degenerate data lead to a number that is not one?"
+_STEPS = 60
 
 
 def cases(quick: bool) -> list[dict[str, object]]:
@@ -27,7 +28,7 @@ def conditions(quick: bool) -> dict[str, object]:
     """What all cases share."""
     return {
         "data": "600 frames of a generated body; fifty of them; the body pressed flat; ten points at one place",
-        "steps": "60; at batch 2048 there are no more than 600 frames in a batch",
+        "steps": f"{_STEPS}; at batch 2048 there are no more than 600 frames in a batch",
     }
 
 
@@ -35,7 +36,7 @@ def measure(kind: str, rates: float, batch: int, depth: int) -> dict[str, object
     """Whether everything is finite, or the sentence that says why not; and the error, for the curious."""
     data = _data(kind)
     views = datasets.make_views(data, seed=0)
-    plan = scoring.default_schedule(rates, steps=scoring.QUICK_STEPS, batch=batch)
+    plan = scoring.default_schedule(rates, steps=_STEPS, batch=batch)
     try:
         net = fit(views, config=Config(31, depth), schedule=plan, progress=False)
         rec = reconstruct(views, model=net)

@@ -14,7 +14,7 @@ from ...model import Config, DeepNRSfM
 from ...reconstruction import reconstruct
 from ...training import SCHEDULES, Schedule, fit
 
-QUICK_STEPS = 60
+QUICK_STEPS = 20
 # To compare settings of the network itself: longer than the default schedule, and without its pull.
 _LONG = replace(SCHEDULES["default"], steps=2700, pull=0.0)
 
