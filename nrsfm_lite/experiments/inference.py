@@ -16,7 +16,7 @@ _POINTS = 31
 
 def cases(quick: bool) -> list[dict[str, object]]:
     """Number of frames, with and without the refinement of each frame."""
-    return [{"frames": n, "refine": r} for r in (False, True) for n in ((1000,) if quick else (10_000, 100_000))]
+    return [{"frames": n, "refine": r} for r in (False, True) for n in ((300,) if quick else (10_000, 100_000))]
 
 
 def conditions(quick: bool) -> dict[str, object]:
