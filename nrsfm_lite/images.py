@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from . import normalizer
 from .cameras import nearest_orthonormal
@@ -74,6 +75,11 @@ class Images:
     def X(self) -> np.ndarray:
         """(F, P, 2), `centred` in units of `scale`: what the classical methods work on."""
         return self.centred / self.scale
+
+    def tensors(self, part: slice = slice(None), device: torch.device | str = "cpu") -> tuple[Tensor, Tensor, Tensor]:
+        """`centred`, `mean` and `weight` of some frames as tensors on a device: what `Normalizer.normalize` takes."""
+        X, mean, weight = (torch.as_tensor(a[part]).to(device) for a in (self.centred, self.mean, self.weight))
+        return X, mean, weight
 
     def completed(self, points: np.ndarray) -> Images:
         """The same images with all points at hand, (F, P, 2) in the user's units; `visible` stays what it was."""

@@ -187,7 +187,7 @@ def _frames(model: DeepNRSfM, W: Any, visible: Any) -> _Frames:
     images = parse(W, visible)
     if model.config.n_points != images.n_points:
         raise ValueError(f"model was trained for {model.config.n_points} points, but W has {images.n_points}.")
-    X, mean, weight = (torch.as_tensor(a).to(model.device) for a in (images.centred, images.mean, images.weight))
+    X, mean, weight = images.tensors(device=model.device)
     image, X, _ = model.normalizer.normalize(X, mean, weight)
     return _Frames(image.to(model.dtype), X.to(model.dtype), weight.to(model.dtype), *_lift(model, image))
 

@@ -144,15 +144,9 @@ def _check_same(model: DeepNRSfM, **settings: Any) -> None:
 
 def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> Prior:
     """The shape prior of these frames."""
-    X, mean, weight = _part(images, slice(None), model.device)
+    X, mean, weight = images.tensors(device=model.device)
     image, X, _ = model.normalizer.normalize(X, mean, weight)
     return learn_prior(model, image, X.cpu(), weight.cpu(), torch.Generator().manual_seed(seed))
-
-
-def _part(images: Images, part: slice, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Centred points, means and weights of some frames, as tensors on a device."""
-    X, mean, weight = (torch.as_tensor(a[part]).to(device) for a in (images.centred, images.mean, images.weight))
-    return X, mean, weight
 
 
 def _infer(
@@ -164,7 +158,7 @@ def _infer(
     with tqdm(total=F, desc="refining", unit="frame", disable=not (progress and how), mininterval=0.5) as bar:
         for first in range(0, F, _CHUNK):
             part = slice(first, first + _CHUNK)
-            S[part], M[part], t[part] = infer(model, *_part(images, part, model.device), how)
+            S[part], M[part], t[part] = infer(model, *images.tensors(part, model.device), how)
             bar.update(len(S[part]))
     return S, M, t
 

@@ -232,7 +232,7 @@ def train(
     """`fit` of images that have been read; nothing is checked."""
     random = torch.Generator().manual_seed(seed)
     net = DeepNRSfM(config, generator=random).float()
-    W, mean, weight = (torch.as_tensor(a) for a in (images.centred, images.mean, images.weight))
+    W, mean, weight = images.tensors()
     with use_threads(threads):
         net.normalizer = learn_normalizer(net.normalizer, W, mean, weight)
         image, X, _ = net.normalizer.normalize(W, mean, weight)

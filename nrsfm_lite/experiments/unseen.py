@@ -65,7 +65,7 @@ def _train(views, change, steps, seed):
     random = torch.Generator().manual_seed(seed)
     net = DeepNRSfM(Config(views.n_points), generator=random)
     images = parse(views.points2d)
-    W, mean, weight = (torch.as_tensor(a) for a in (images.centred, images.mean, images.weight))
+    W, mean, weight = images.tensors()
     net.normalizer = learn_normalizer(net.normalizer, W, mean, weight)
     X = net.normalizer.normalize(W, mean, weight)[1].float()
     depth = (torch.as_tensor(nearness(views.points3d, views.cameras)) / net.normalizer.scale).float()
