@@ -18,12 +18,13 @@ from torch import Tensor, nn
 from . import normalizer, weights
 from .cameras import nearest_orthonormal
 from .checks import check_shape, one_of, truth, whole
+from .gaussian import Gaussian
 from .normalizer import Normalizer
-from .shape_prior import Gaussian, Prior
+from .shape_prior import Prior
 from .sparse_coding import mutual_coherence
 
 _FOUND = ("scale", "origin", "covariance")  # fields of a `Normalizer` that training finds
-_OF_A_GAUSSIAN = ("mean", "covariance", "noise")
+_OF_A_GAUSSIAN = ("mean", "covariance", "noise", "share")
 EPSILON = 0.05  # ε of the 4×2 model: every entry of the row of translations in D₁, up to its sign
 
 
@@ -354,7 +355,9 @@ class DeepNRSfM(nn.Module):
         self.normalizer = replace(self.normalizer, scale=float(scale), origin=origin, covariance=covariance)
         n = len({key.split("/")[1] for key in state if key.startswith("prior/")})
         parts = [{key: state[f"prior/{i}/{key}"] for key in _OF_A_GAUSSIAN} for i in range(n)]
-        self.prior = tuple(Gaussian(p["mean"], p["covariance"], float(p["noise"])) for p in parts) or None
+        self.prior = (
+            tuple(Gaussian(p["mean"], p["covariance"], float(p["noise"]), float(p["share"])) for p in parts) or None
+        )
 
     def to_arrays(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         """(config, arrays) as a dict and a dict of NumPy arrays: all that `from_arrays` needs."""

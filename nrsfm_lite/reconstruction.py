@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from . import normalizer, shape_prior
+from . import baselines, normalizer, shape_prior
 from .cameras import nearest_orthonormal
 from .checks import one_of, truth, whole
 from .data import Reconstruction
@@ -19,9 +19,10 @@ from .images import Images, read
 from .model import Config, DeepNRSfM
 from .shape_prior import Prior
 from .threads import use_threads
-from .training import SCHEDULES, check_training, learn_prior, read_to_train, train
+from .training import SCHEDULES, check_training, learn_prior, or_warn, read_to_train, train
 
 _CHUNK = 4096  # frames per pass: memory stays flat in the number of frames
+_FEW = 2000  # frames, up to which other starts than the network are tried
 _REFINE_STEPS = 150
 _REFINE_RATE = 0.07
 
@@ -101,13 +102,16 @@ def reconstruct(
         )
     seed = whole("seed", seed, 0)
     trained = model is None
+    anew = adapt  # the prior is learned here, from these frames
     if model is None:
         plan = SCHEDULES["default"] if steps is None else replace(SCHEDULES["default"], steps=steps)
         device = check_training(seed, device, checkpoint)
         images = read_to_train(W, visible, confidence)
         config = Config(images.n_points, projection=projection or "orthographic", translation=translation or False)
+        anew = adapt or (refine is True and len(images) <= _FEW)
         model = train(
-            images, config, plan, seed=seed, device=device, progress=progress, checkpoint=checkpoint
+            images, config, plan, seed=seed, device=device, progress=progress, checkpoint=checkpoint,
+            with_prior=not (anew and refine is True),
         )  # fmt: skip
     else:
         _check_given(model, steps=steps, checkpoint=checkpoint, device=device)
@@ -117,11 +121,17 @@ def reconstruct(
             raise ValueError(f"model was trained for {model.config.n_points} points, but W has {images.n_points}.")
     with use_threads(1):  # as in `fit`: never slow on a busy machine, and the same result everywhere
         how: Prior | str | None = "code" if refine == "code" else None
+        cameras = None
         if refine is True:
-            how = None if adapt else model.prior
-            if how is None and not (trained and not adapt):  # `train` has said why there is none
-                how = _learn_prior(model, images, seed)
-        S, M, t = _infer(model, images, how, progress)
+            how = model.prior
+            if anew or (how is None and not trained):  # else `train` has said why there is none
+                found = (
+                    or_warn(lambda: _learn_prior(model, images, seed)) if trained else _learn_prior(model, images, seed)
+                )
+                how, cameras = found or (None, None)
+            if trained:
+                model.prior = how
+        S, M, t = _infer(model, images, how, progress, cameras)
     return images.reconstruction(S, M, t, scale=1.0, method="deep_nrsfm", coherence=model.coherence, model=model)
 
 
@@ -142,15 +152,26 @@ def _check_same(model: DeepNRSfM, **settings: Any) -> None:
             raise ValueError(f"model was trained for {name}={own!r}, not {value!r}.")
 
 
-def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> Prior:
-    """The shape prior of these frames."""
+def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> tuple[Prior, Tensor | None]:
+    """The shape prior of these frames; of few frames also cameras to start from, for then the network may be wrong."""
     X, mean, weight = images.tensors(device=model.device)
     image, X, _ = model.normalizer.normalize(X, mean, weight)
-    return learn_prior(model, image, X.cpu(), weight.cpu(), torch.Generator().manual_seed(seed))
+    if len(images) > _FEW:
+        return learn_prior(model, image, X.cpu(), weight.cpu(), torch.Generator().manual_seed(seed)), None
+    with torch.no_grad():
+        _, S, M = model.lift(image)
+    X, weight, image, S, M = X.cpu(), weight.cpu(), image.double().cpu(), S.double().cpu(), M.double().cpu()
+    starts = [(S, M)]
+    for other_S, other_M in baselines.starts(image.numpy(), seed):
+        # Into the network's world, so that its cameras of other frames remain a start for this prior.
+        U, _, Vh = torch.linalg.svd(torch.einsum("fij,fkj->ik", M, torch.as_tensor(other_M)))
+        starts.append((torch.as_tensor(other_S) @ (U @ Vh).mT, U @ Vh @ torch.as_tensor(other_M)))
+    S, M = starts[shape_prior.choose(X, weight, starts)]
+    return shape_prior.learn(X, weight, S, M), M
 
 
 def _infer(
-    model: DeepNRSfM, images: Images, how: Prior | str | None, progress: bool
+    model: DeepNRSfM, images: Images, how: Prior | str | None, progress: bool, cameras: Tensor | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Shapes, cameras and translations of all frames, in the user's units, chunk by chunk."""
     F, P = images.weight.shape
@@ -158,13 +179,19 @@ def _infer(
     with tqdm(total=F, desc="refining", unit="frame", disable=not (progress and how), mininterval=0.5) as bar:
         for first in range(0, F, _CHUNK):
             part = slice(first, first + _CHUNK)
-            S[part], M[part], t[part] = infer(model, *images.tensors(part, model.device), how)
+            start = None if cameras is None else cameras[part]
+            S[part], M[part], t[part] = infer(model, *images.tensors(part, model.device), how, start)
             bar.update(len(S[part]))
     return S, M, t
 
 
 def infer(
-    model: DeepNRSfM, W: Tensor, mean: Tensor, weight: Tensor, how: Prior | str | None = None
+    model: DeepNRSfM,
+    W: Tensor,
+    mean: Tensor,
+    weight: Tensor,
+    how: Prior | str | None = None,
+    cameras: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Shapes, cameras and translations of some frames by a trained network, in double precision at the end.
 
@@ -174,6 +201,8 @@ def infer(
     W, mean, weight : double tensors (B, P, 2), (B, 2) and (B, P) where the model is
         Centred image points, what was subtracted, and how much each point counts.
     how : shape prior (as `shape_prior.learn` returns it), "code" or None
+    cameras : (B, 3, 2) tensor, optional
+        From where a shape prior starts. Default: the network's.
         How to go on from the network's guess.
 
     Returns
@@ -184,7 +213,7 @@ def infer(
     with torch.no_grad():
         psi, S, M = model.lift(image)
     if how is not None and not isinstance(how, str):
-        S, M = shape_prior.apply(how, X.cpu(), weight.cpu(), M.cpu())
+        S, M = shape_prior.apply(how, X.cpu(), weight.cpu(), M.cpu() if cameras is None else cameras)
     elif how == "code":
         psi, M = _refine_code(model, X.to(model.dtype), weight, psi, M)
         with torch.no_grad():

@@ -1,52 +1,54 @@
 """A prior over shapes, learned from images whose cameras are roughly known (chapter 10).
 
-A trained network puts every frame into one coordinate system, though its shapes are still coarse. From
-there the images themselves tell how shapes vary, because every camera hides another direction. The
-coordinates of all points are taken as one Gaussian vector,
+A trained network, or any other method, puts every frame into one coordinate system, though its shapes are still
+coarse. From there the images themselves tell how shapes vary, because every camera hides another direction:
+expectation maximisation learns one Gaussian over all shapes (`gaussian`), and frames that are mirrored against the
+others are found and repaired. A body that walks and sits is more than one Gaussian, and a collection of six chairs is
+six rigid shapes. So the shapes are then shared out among the components of a mixture, each learned in the same way.
+How far the one Gaussian, and each component, may vary, and how many components there are, is decided by the likelihood
+of images that were kept back.
 
-    s ~ N(mean, C),   w = A s + t + noise of variance σ²,   A: what the camera sees, without hidden points,
-
-and expectation maximisation learns mean, C and σ from all frames at once. Torresani, Hertzmann and Bregler
-(2008) do this for a basis of few shapes; here C is whole. A body that walks and sits is more than one
-Gaussian: the shapes are then assigned to the components of a mixture, each learned in the same way.
-
-Given the prior, a frame's shape is the solution of a linear system, hidden points included, and its camera
-takes a few Newton steps on the likelihood of its image, in which the shape has been integrated out.
-
-Shapes in comments: B frames, P points. Points are in the network's units. The coordinates of a shape are
-ordered by axis (all x, all y, all z), so that C has nine P×P blocks and all work is products of matrices.
+Shapes in comments: B frames, P points. Points are in the units of whoever calls.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-COMPONENTS = 8  # at most
+from .gaussian import (
+    Gaussian,
+    covariance,
+    fit,
+    maximise,
+    negative_log_evidence,
+    right_hand,
+    without_noise,
+)
+from .gaussian import negative_log_likelihood as of_each_frame
+
+MOST_FRAMES = 20_000  # that `learn` takes a look at
+_KEPT_BACK, _LEAST_KEPT_BACK = 300, 20  # frames, for decisions: a tenth, at most and at least so many
+_FRAMES_OF_THE_WHOLE = 4000  # more add little to one Gaussian
+_FRAMES_OF_A_TRIAL = 800
 _FRAMES_PER_COMPONENT = 250  # on average, at least
-_ITERATIONS, _ITERATIONS_OF_A_COMPONENT, _ASSIGNMENTS = 15, 6, 2
+_ROUNDS, _ITERATIONS_OF_A_ROUND = 4, 4  # of the whole; between rounds mirrored frames are repaired
+_RANKS = (16, 8, 4, 2, 1, 0)  # that are tried for the whole, beside all directions, as long as there is hope
+_RIGID = 16  # components of rank zero to begin with, at most, before those that are alike are joined
+_FRAMES_PER_RIGID = 25  # on average, at least, to begin with
+_HOPELESS = 0.5  # by which −log p per coordinate is above the best, so that nothing of the kind is tried any further
+_ALIKE = 4e-3  # by which joining two components may raise −log p per coordinate
+_NEAREST = 4  # components whose likelihood is asked for, by the distance of their means
 _NEWTON_STEPS, _NEWTON_STEPS_IN_A_COMPONENT = 4, 3  # of a frame's camera
-_FIRST_NOISE, _LEAST_NOISE = 1e-2, 1e-3  # σ
-_FREEDOM = 1e-2  # variance that C grants every coordinate at the start, beside that of the network's shapes
+_FIRST_NOISE = 1e-2  # σ
+_FREEDOM = 1e-2  # variance that C grants every coordinate at the start, beside that of the shapes to start from
 _LARGEST = 10.0  # root mean square distance of a shape's points: a network that has diverged may say anything
-_SHIFT = 1.0  # standard deviation of t, which stays zero unless points are hidden
-_LONGEST_STEP = 0.3  # radians per Newton step
-_DAMPING = 3e-3  # of a Newton step, as a share of the mean curvature
-_CHUNK = 64  # frames per pass, so that their matrices stay in the cache
 
-
-@dataclass(frozen=True)
-class Gaussian:
-    """Of shapes: mean (P, 3), covariance (3P, 3P) ordered by axis, and the variance σ² of image coordinates."""
-
-    mean: Tensor
-    covariance: Tensor
-    noise: float
-
-
+_Frames = tuple[Tensor, Tensor, Tensor, Tensor]  # X, weight, S and M
 Prior = tuple[Gaussian, ...]  # the whole first; then, if any, the components of the mixture
 
 
@@ -58,43 +60,64 @@ def learn(X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -> Prior:
     X : (B, P, 2) tensor, centred over the visible points, zero where hidden
     weight : (B, P) tensor, bool or from 0 to 1: a point of weight ω has the noise σ²/ω; 0 hides it
     S, M : (B, P, 3) and (B, 3, 2) tensors
-        A network's shapes and cameras, to start from.
+        Shapes and cameras to start from, such as a network's.
 
     Returns
     -------
-    tuple of Gaussian, in double precision: first that of all shapes; then, if the frames are many enough for
-    two or more, those of up to eight components.
+    tuple of Gaussian, in double precision: first that of all shapes; then, where images that were kept back are
+    likelier under a mixture, its components.
     """
-    # Imported here, since only training needs it and it takes a while.
-    from scipy.cluster.vq import kmeans2
+    X, S, M = X.double(), _checked(S.double()), M.double().clone()
+    order = torch.randperm(len(X), generator=torch.Generator().manual_seed(0))[:MOST_FRAMES]
+    n = min(_KEPT_BACK, len(order) // 10)
+    if n < _LEAST_KEPT_BACK:  # too few to decide anything
+        return (without_noise(_whole(X, weight, S, M)[0]),)
+    kept, rest = order[:n], order[n:]
 
-    X, S, M = X.double(), S.double(), M.double()
-    B, P, _ = X.shape
-    S = torch.nan_to_num(S - S.mean(1, keepdim=True))
-    S = S / (S.flatten(1).norm(dim=1) / (_LARGEST * P**0.5)).clamp(min=1)[:, None, None]
-    centred = torch.eye(P, dtype=X.dtype) - 1 / P  # C gives the centroid no variance: that is t's part
-    start = _covariance(S) + _FREEDOM * torch.eye(3, dtype=X.dtype).kron(centred)
-    whole = Gaussian(S.mean(0), start, _FIRST_NOISE**2)
-    whole, M = _maximise(whole, X, weight, M, _ITERATIONS, 1)
-    whole = _without_noise(whole)
-    n = min(COMPONENTS, B // _FRAMES_PER_COMPONENT)
-    if n < 2:
-        return (whole,)
-    S, M = _fit(whole, X, weight, M, 1)
-    component = torch.as_tensor(kmeans2(S.flatten(1).numpy(), n, minit="++", seed=0)[1])
-    mixture: list[Gaussian] = []
-    for _ in range(_ASSIGNMENTS):
-        if mixture:
-            component, S, M = _assign(mixture, X, weight, M, 0)
-        mixture = []
-        for k in range(n):
-            i = (component == k).nonzero()[:, 0]
-            if len(i) < _FRAMES_PER_COMPONENT / 4:
-                continue
-            first = Gaussian(S[i].mean(0), _covariance(S[i]) + whole.covariance / 10, whole.noise)
-            gaussian, M[i] = _maximise(first, X[i], weight[i], M[i], _ITERATIONS_OF_A_COMPONENT, 20)
-            mixture.append(gaussian)
-    return (whole, *map(_without_noise, mixture))
+    def at(i: Tensor) -> _Frames:
+        return X[i], weight[i], S[i], M[i]
+
+    some = rest[:_FRAMES_OF_THE_WHOLE]
+    first, M[some] = _whole(*at(some))
+    S, M = _apply_one(without_noise(first), X, weight, M)
+    whole, rank = _best_rank(first, at(some), at(kept))
+    if rank is not None:
+        S, M = _apply_one(whole, X, weight, M)
+    best: Prior = (whole,)
+    lowest = _unlikeliness(best, at(kept))
+    mixtures = [_rigid_components(at(some), whole, at(kept), lowest)]
+    most = len(rest) // _FRAMES_PER_COMPONENT
+    for n in (most // 9, most // 3, most):
+        if n > 1:
+            frames = at(rest[: n * _FRAMES_PER_COMPONENT])
+            mixtures.append(_components(n, frames, whole, replace(_FREELY, rank=rank)))
+    for mixture in mixtures:
+        if mixture and (value := _unlikeliness((whole, *mixture), at(kept))) < lowest:
+            best, lowest = (whole, *mixture), value
+    return best
+
+
+def choose(X: Tensor, weight: Tensor, starts: Sequence[tuple[Tensor, Tensor]]) -> int:
+    """Which of several starts leads to the prior under which images that it has not seen are likeliest.
+
+    From each, a few iterations for one Gaussian; frames kept back judge, with their own cameras from the same start.
+    With few frames, hidden-away frames would be too few, and all of them judge.
+
+    Parameters
+    ----------
+    X, weight : as in `learn`
+    starts : pairs of S and M, as in `learn`
+    """
+    order = torch.randperm(len(X), generator=torch.Generator().manual_seed(0))
+    n = min(_KEPT_BACK, len(X) // 10)
+    kept, rest = (order, order) if n < _LEAST_KEPT_BACK else (order[:n], order[n:][: 2 * _FRAMES_OF_A_TRIAL])
+    values = []
+    for S, M in starts:
+        S, M = _checked(S.double()), M.double().clone()
+        whole = without_noise(_whole(X[rest].double(), weight[rest], S[rest], M[rest])[0])
+        frames = X[kept].double(), weight[kept]
+        values.append(_unlikeliness((whole,), (*frames, *_apply_one(whole, *frames, M[kept]))))
+    return int(torch.tensor(values).nan_to_num(math.inf).argmin())
 
 
 def apply(prior: Prior, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Tensor, Tensor]:
@@ -105,10 +128,11 @@ def apply(prior: Prior, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Tensor, T
     prior : what `learn` returns
     X, weight, M : as in `learn`; M is the camera to start from
     """
-    X = X.double()
-    S, M = _fit(prior[0], X, weight, M.double(), _NEWTON_STEPS)
+    X, M = X.double(), M.double()
+    S, M = _apply_one(prior[0], X, weight, M)
     if len(prior) > 1:
-        _, S, M = _assign(prior[1:], X, weight, M, _NEWTON_STEPS_IN_A_COMPONENT)
+        component = _assign(prior[1:], X, weight, S, M)
+        S, M = _fit_each(prior[1:], component, X, weight, M, _NEWTON_STEPS_IN_A_COMPONENT)
     return S, M
 
 
@@ -118,170 +142,182 @@ def negative_log_likelihood(prior: Prior, X: Tensor, weight: Tensor, M: Tensor) 
     Parameters as in `apply`. Every frame is taken for the component under which it is likeliest.
     """
     X, M = X.double(), M.double()
-    each = torch.stack([_negative_log_likelihood(g, X, weight, M) for g in prior[min(1, len(prior) - 1) :]])
-    return float((each.amin(0) / (2 * (weight > 0).sum(1))).mean())
+    mixture = _mixture(prior)
+    component = _assign(mixture, X, weight, fit(prior[0], X, weight, M, 0)[0], M)
+    each = _of_each_component(of_each_frame, mixture, component, X, weight, M)
+    return float((each / (2 * (weight > 0).sum(1))).mean())
 
 
-def _root_weight(weight):
-    """√ω of every image coordinate, (B, 2P). Rows of an image times √ω all have the noise σ²; zero strikes them out."""
-    return weight.double().sqrt().repeat(1, 2)
+def _mixture(prior):
+    """The components, or the whole where there are none."""
+    return prior[1:] or prior
 
 
-def _covariance(S):
-    return torch.cov((S - S.mean(0)).mT.flatten(1).T, correction=0)
+def _checked(S):
+    """Centred, and of a finite size."""
+    S = torch.nan_to_num(S - S.mean(1, keepdim=True))
+    return S / (S.flatten(1).norm(dim=1) / (_LARGEST * S.shape[1] ** 0.5)).clamp(min=1)[:, None, None]
 
 
-def _maximise(start, X, weight, M, iterations, strength):
-    """Expectation maximisation from a Gaussian, which counts as much as `strength` frames: (Gaussian, cameras)."""
-    root_weight = _root_weight(weight)
-    M = M.clone()
-    B, P, _ = X.shape
-    gaussian = start
-    for _ in range(iterations):
-        C, noise = gaussian.covariance, gaussian.noise
-        offset, outer, known, rest = 0.0, 0.0, 0.0, 0.0
-        for part in torch.arange(B).split(_CHUNK):
-            post = _posterior(gaussian, X[part], root_weight[part], M[part])
-            d = (post.shapes - gaussian.mean).mT.flatten(1)  # (b, 3P)
-            offset = offset + d.sum(0)
-            outer = outer + d.T @ d
-            known = known + post.pairs.flatten(0, 1).T @ _split(post.precision).flatten(0, 1)  # Σ Aᵀ Σ⁻¹ A
-            rest = rest + post.noise
-            M[part] = _newton_step(gaussian, post, M[part])
-        # What the images leave open counts too: each shape's covariance given its image is C − C Aᵀ Σ⁻¹ A C.
-        offset = offset / B
-        new = C + (outer - C @ _join(known, 3) @ C) / B - torch.outer(offset, offset)
-        new = (B * new + strength * start.covariance) / (B + strength)  # few frames do not make C singular
-        noise = max(float(rest / (root_weight > 0).sum()), _LEAST_NOISE**2)
-        gaussian = Gaussian(gaussian.mean + offset.view(3, P).T, (new + new.T) / 2, noise)
+def _apply_one(gaussian, X, weight, M):
+    """Shapes and cameras under one Gaussian, in the hand that is likelier."""
+    S, M = fit(gaussian, X, weight, M, _NEWTON_STEPS)
+    return right_hand(gaussian, X, weight, S, M)[:2]
+
+
+def _whole(X, weight, S, M):
+    """One Gaussian, its noise still in C, and the cameras; mirrored frames repaired between rounds."""
+    P = X.shape[1]
+    centred = torch.eye(P, dtype=X.dtype) - 1 / P  # C gives the centroid no variance: that is t's part
+    start = covariance(S) + _FREEDOM * torch.eye(3, dtype=X.dtype).kron(centred)
+    gaussian = Gaussian(S.mean(0), start, _FIRST_NOISE**2)
+    for _ in range(_ROUNDS):
+        gaussian, M = maximise(gaussian, X, weight, M, iterations=_ITERATIONS_OF_A_ROUND, strength=1)
+        S, M = fit(gaussian, X, weight, M, 0)
+        _, M, _, _ = right_hand(gaussian, X, weight, S, M)
     return gaussian, M
 
 
-def _without_noise(gaussian):
-    """The Gaussian less what its covariance holds in all directions alike, which goes to σ².
+def _best_rank(first, frames, kept):
+    """One Gaussian without noise, and in how many directions it varies; None: in all."""
 
-    The same variance in all directions cannot be told from noise of the images, and is taken for it. It is
-    read off the smallest tenth of the eigenvalues, twice, since the smallest are estimated too small.
-    """
-    values, vectors = torch.linalg.eigh(gaussian.covariance)
-    flat = 2 * values[3:].quantile(0.1).clamp(min=0)  # the first three belong to the centroid
-    C = (vectors * (values - flat).clamp(min=0)) @ vectors.T
-    least = 1e-7 * float(values[-1])  # of images of single precision nothing finer can be said
-    return Gaussian(gaussian.mean, C, max(gaussian.noise + float(flat), least))
+    def limited(rank, n, rounds):
+        X, weight, _, M = (x[:n] for x in frames)
+        gaussian, _ = maximise(first, X, weight, M, iterations=rounds * _ITERATIONS_OF_A_ROUND, strength=1, rank=rank)
+        return without_noise(gaussian, rank)
 
-
-def _fit(gaussian, X, weight, M, steps):
-    """Shapes and cameras after some Newton steps of the cameras."""
-    S, M = torch.empty(*X.shape[:2], 3, dtype=X.dtype), M.clone()
-    for part in torch.arange(len(X)).split(_CHUNK):
-        x, root_weight, m = X[part], _root_weight(weight[part]), M[part]
-        for _ in range(steps):
-            m = _newton_step(gaussian, _posterior(gaussian, x, root_weight, m), m)
-        S[part], M[part] = _posterior(gaussian, x, root_weight, m).shapes, m
-    return S, M
+    best, chosen = without_noise(first), None
+    lowest = _unlikeliness((best,), kept)
+    for rank in _RANKS:
+        value = _unlikeliness((limited(rank, _FRAMES_OF_A_TRIAL, 1),), kept)
+        if value > lowest + _HOPELESS:
+            break
+        if value < lowest:
+            lowest, chosen = value, rank
+    return (best, None) if chosen is None else (limited(chosen, len(frames[0]), _ROUNDS), chosen)
 
 
-def _assign(mixture, X, weight, M, steps):
-    """Every frame to the component under which its image is likeliest: that component, and shapes and cameras in it."""
-    component = torch.stack([_negative_log_likelihood(g, X, weight, M) for g in mixture]).argmin(0)
+@dataclass(frozen=True)
+class _Plan:
+    """How the components of a mixture are learned."""
+
+    rank: int | None
+    rounds: int  # of sharing out the frames anew
+    iterations: int  # of a component in each round
+    strength: float  # frames that a component's start counts for
+    least: int  # frames of a component
+
+
+_FREELY = _Plan(rank=None, rounds=2, iterations=4, strength=20, least=_FRAMES_PER_COMPONENT // 4)
+_RIGIDLY = _Plan(rank=0, rounds=3, iterations=6, strength=0.1, least=8)
+
+
+def _components(n, frames, whole, plan):
+    """A mixture of up to n Gaussians, from the shapes under the whole."""
+    # Imported here, since only training needs it and it takes a while.
+    from scipy.cluster.vq import kmeans2
+
+    first = kmeans2(frames[2].flatten(1).numpy(), n, minit="++", seed=0)[1]
+    return _learn_each(torch.as_tensor(first), frames, whole, plan)
+
+
+def _learn_each(component, frames, whole, plan):
+    """The Gaussians of a mixture, each from its frames, which are shared out anew after every round."""
+    X, weight, S, M = frames
+    M = M.clone()
+    mixture: list[Gaussian] = []
+    for _ in range(plan.rounds):
+        if mixture:
+            component = _assign(mixture, X, weight, S, M)
+            S, M = _fit_each(mixture, component, X, weight, M, 0)
+        before, mixture = mixture, []
+        for k in component.unique().tolist():
+            i = (component == k).nonzero()[:, 0]
+            if len(i) >= plan.least:
+                start = _start(S[i], whole)
+                if before:  # go on, but let go of some of what was learned from other frames
+                    start = replace(before[k], covariance=(start.covariance + before[k].covariance) / 2)
+                how = {"iterations": plan.iterations, "strength": plan.strength, "rank": plan.rank}
+                gaussian, M[i] = maximise(start, X[i], weight[i], M[i], **how)
+                mixture.append(replace(gaussian, share=len(i) / len(X)))
+    return tuple(without_noise(g, plan.rank) for g in mixture)
+
+
+def _start(S, whole):
+    """A component to begin with."""
+    return Gaussian(S.mean(0), covariance(S) + whole.covariance / 10, whole.noise)
+
+
+def _rigid_components(frames, whole, kept, lowest):
+    """A mixture of rigid shapes, or nothing if others explain images better; components that are alike are joined."""
+    few, some = (tuple(x[:n] for x in frames) for n in (_FRAMES_OF_A_TRIAL, 2 * _FRAMES_OF_A_TRIAL))
+    n = min(_RIGID, len(few[0]) // _FRAMES_PER_RIGID)
+    if n < 2:
+        return ()
+    first = _components(n, few, whole, replace(_RIGIDLY, rounds=1))
+    if not first or _unlikeliness((whole, *first), kept) > lowest + _HOPELESS:
+        return ()
+    mixture = _components(n, some, whole, _RIGIDLY)
+    value = _unlikeliness((whole, *mixture), kept)
+    if value >= lowest:
+        return ()
+    X, weight, S, M = some
+    while len(mixture) > 1:
+        means = torch.stack([g.mean for g in mixture]).flatten(1)
+        apart = torch.cdist(means, means).fill_diagonal_(torch.inf)
+        pair = divmod(int(apart.argmin()), len(mixture))
+        i = torch.isin(_assign(mixture, *some), torch.tensor(pair)).nonzero()[:, 0]
+        start = replace(_start(S[i], whole), share=sum(mixture[k].share for k in pair))
+        iterations = _RIGIDLY.rounds * _RIGIDLY.iterations
+        joined, _ = maximise(start, X[i], weight[i], M[i], iterations=iterations, strength=_RIGIDLY.strength, rank=0)
+        fewer = (*(g for k, g in enumerate(mixture) if k not in pair), without_noise(joined, 0))
+        new = _unlikeliness((whole, *fewer), kept)
+        if new > value + _ALIKE:
+            break
+        mixture, value = fewer, new
+    return _learn_each(_assign(mixture, *frames), frames, whole, _RIGIDLY)
+
+
+def _assign(mixture, X, weight, S, M):
+    """The component of every frame: the one under which its image is likeliest, among those nearest to its shape."""
+    means = torch.stack([g.mean for g in mixture]).flatten(1)
+    near = torch.cdist(S.flatten(1), means).topk(min(_NEAREST, len(mixture)), largest=False).indices
+    lowest = torch.full((len(X),), torch.inf, dtype=X.dtype)
+    component = near[:, 0].clone()
+    for k, gaussian in enumerate(mixture):
+        i = (near == k).any(1).nonzero()[:, 0]
+        if len(i):
+            value = of_each_frame(gaussian, X[i], weight[i], M[i]) - math.log(gaussian.share)
+            better = i[value < lowest[i]]
+            lowest[better], component[better] = value[value < lowest[i]], k
+    return component
+
+
+def _fit_each(mixture, component, X, weight, M, steps):
+    """Shapes and cameras, each frame in its component."""
     S, M = torch.empty(*X.shape[:2], 3, dtype=X.dtype), M.clone()
     for k, gaussian in enumerate(mixture):
         i = (component == k).nonzero()[:, 0]
         if len(i):
-            S[i], M[i] = _fit(gaussian, X[i], weight[i], M[i], steps)
-    return component, S, M
+            S[i], M[i] = fit(gaussian, X[i], weight[i], M[i], steps)
+    return S, M
 
 
-def _negative_log_likelihood(gaussian, X, weight, M):
-    """−log p(image) of each frame (B,), the cameras as they are."""
-    result = torch.empty(len(X), dtype=X.dtype)
-    for part in torch.arange(len(X)).split(_CHUNK):
-        root_weight = _root_weight(weight[part])
-        y, _, factor = _marginal(gaussian, X[part], root_weight, M[part])
-        half = torch.linalg.solve_triangular(factor, y[..., None], upper=False)
-        hidden = root_weight == 0
-        logs = factor.diagonal(dim1=1, dim2=2).log() - root_weight.masked_fill(hidden, gaussian.noise**0.5).log()
-        count = (~hidden).double().sum(1)
-        result[part] = half.square().sum((1, 2)) / 2 + logs.sum(1) + count * math.log(2 * math.pi) / 2
-    return result
+def _unlikeliness(prior, frames):
+    """−log p(image) per visible coordinate of frames that were kept back, cameras integrated out; mean over frames."""
+    X, weight, S, M = frames
+    mixture = _mixture(prior)
+    component = _assign(mixture, X, weight, S, M)
+    _, M = _fit_each(mixture, component, X, weight, M, 2)
+    each = _of_each_component(negative_log_evidence, mixture, component, X, weight, M)
+    return float((each / (2 * (weight > 0).sum(1))).mean())
 
 
-@dataclass(frozen=True)
-class _Posterior:
-    """What some images say about their shapes, given a Gaussian and the cameras."""
-
-    shapes: torch.Tensor  # (B, P, 3) posterior means
-    pairs: torch.Tensor  # (B, 4, 9): products of two entries of a camera, one for each block of C
-    precision: torch.Tensor  # (B, 2P, 2P): √Ω Σ⁻¹ √Ω
-    weighted: torch.Tensor  # (B, 2P): √Ω Σ⁻¹ √Ω (w − A mean)
-    noise: torch.Tensor  # expected sum of squares of √Ω times what the images miss by, for σ²
-
-
-def _marginal(gaussian, X, root_weight, M):
-    """The distribution of some images with their shapes integrated out; rows are weighted by √Ω (B, 2P).
-
-    Returns y = √Ω (w − A mean), products of camera entries, and the Cholesky factor of Σ = √Ω A C Aᵀ √Ω + σ².
-    """
-    B, P, _ = X.shape
-    y = (X - gaussian.mean @ M).mT.reshape(B, 2 * P) * root_weight
-    pairs = (M.mT[:, :, None, :, None] * M.mT[:, None, :, None, :]).reshape(B, 4, 9)
-    Sigma = _join(pairs @ _split(gaussian.covariance), 2)
-    if not (root_weight == 1).all():
-        shift = _SHIFT**2 * torch.eye(2, dtype=X.dtype).kron(torch.ones(P, P, dtype=X.dtype))
-        Sigma = (Sigma + shift) * (root_weight[:, :, None] * root_weight[:, None])
-    Sigma.diagonal(dim1=1, dim2=2).add_(gaussian.noise)
-    return y, pairs, torch.linalg.cholesky(Sigma)
-
-
-def _posterior(gaussian, X, root_weight, M):
-    """The posterior of some frames; `root_weight` as in `_marginal`."""
-    B, P, _ = X.shape
-    y, pairs, factor = _marginal(gaussian, X, root_weight, M)
-    precision = torch.cholesky_inverse(factor)
-    weighted = (precision @ y[..., None])[..., 0]
-    # What an image misses by, and what is unsure about that; rows struck out add nothing.
-    noise = gaussian.noise**2 * (weighted.square().sum() - _trace(precision)) + gaussian.noise * root_weight.numel()
-    if not (root_weight == 1).all():
-        precision = precision * (root_weight[:, :, None] * root_weight[:, None])
-        weighted = weighted * root_weight
-    S = (M @ weighted.view(B, 2, P)).view(B, 3 * P) @ gaussian.covariance
-    return _Posterior(gaussian.mean + S.view(B, 3, P).mT, pairs, precision, weighted, noise)
-
-
-def _newton_step(gaussian, post, M):
-    """The cameras after one Newton step on −log p(image), by a small rotation of each."""
-    B, P, _ = post.shapes.shape
-    a = post.weighted
-    Q = _split(post.precision - a[:, :, None] * a[:, None])  # (B, 4, P²)
-    T = (Q @ _split(gaussian.covariance).T).view(B, 2, 2, 3, 3)
-    g = torch.einsum("bmj,bijlm->bli", M, T) - gaussian.mean.T @ a.view(B, 2, P).mT  # by the entries of M
-    gradient = torch.linalg.cross(M.mT, g.mT).sum(1)  # by a rotation about each axis
-    axes = torch.eye(3, dtype=M.dtype).view(1, 3, 1, 3)
-    moves = torch.linalg.cross(axes, M.mT[:, None])  # (B, 3 axes, 2, 3): what each rotation does to the camera
-    J = (moves @ post.shapes.mT[:, None]).view(B, 3, 2 * P)
-    curvature = J @ post.precision @ J.mT  # Fisher information, never negative
-    diagonal = curvature.diagonal(dim1=1, dim2=2)
-    diagonal += _DAMPING * diagonal.mean(1, keepdim=True) + 1e-9
-    turn = -torch.linalg.solve(curvature, gradient)
-    turn = turn * (_LONGEST_STEP / turn.norm(dim=1, keepdim=True)).clamp(max=1)
-    x, y, z = turn.unbind(1)
-    o = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o], 1).view(B, 3, 3)) @ M
-
-
-def _trace(A):
-    return A.diagonal(dim1=1, dim2=2).sum()
-
-
-def _split(C):
-    """Matrices of n×n blocks of P×P, as rows: (..., nP, nP) -> (..., n², P²). n is 3 for shapes, 2 for images."""
-    n = 3 if C.ndim == 2 else 2
-    P = C.shape[-1] // n
-    return C.unflatten(-1, (n, P)).unflatten(-3, (n, P)).transpose(-3, -2).flatten(-4, -3).flatten(-2)
-
-
-def _join(rows, n):
-    """The way back: (..., n², P²) -> (..., nP, nP)."""
-    P = round(rows.shape[-1] ** 0.5)
-    blocks = rows.unflatten(-1, (P, P)).unflatten(-3, (n, n)).transpose(-3, -2)
-    return blocks.flatten(-2).flatten(-3, -2)
+def _of_each_component(function, mixture, component, X, weight, M):
+    """A negative logarithm of each frame in its component, which is one of several."""
+    value = torch.empty(len(X), dtype=X.dtype)
+    for k, gaussian in enumerate(mixture):
+        i = (component == k).nonzero()[:, 0]
+        if len(i):
+            value[i] = function(gaussian, X[i], weight[i], M[i]) - math.log(gaussian.share)
+    return value

@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,10 +25,11 @@ from .model import Config, DeepNRSfM
 from .shape_prior import Prior
 from .threads import use_threads
 
+Learned = TypeVar("Learned")
+
 MIN_FRAMES = 10
 MIN_POINTS = 4
 _CHECKPOINT_EVERY = 500  # steps
-PRIOR_FRAMES = 4000  # more add little
 
 
 @dataclass(frozen=True)
@@ -228,8 +229,9 @@ def train(
     checkpoint: str | Path | None = None,
     threads: int | None = 1,
     callback: Callable[[int, DeepNRSfM], None] | None = None,
+    with_prior: bool = True,
 ) -> DeepNRSfM:
-    """`fit` of images that have been read; nothing is checked."""
+    """`fit` of images that have been read; nothing is checked. `with_prior=False` leaves the prior to the caller."""
     random = torch.Generator().manual_seed(seed)
     net = DeepNRSfM(config, generator=random).float()
     W, mean, weight = images.tensors()
@@ -263,11 +265,18 @@ def train(
         for p in net.parameters():
             p.data = p.data.clone()  # no longer a piece of the optimiser's vector
         net.cpu().eval()
-        try:
-            net.prior = learn_prior(net, image.cpu(), X.cpu(), weight.cpu(), random)
-        except Exception as error:  # whatever it is, the finished training must not be lost by it
-            warnings.warn(f"no shape prior could be learned, so nothing will be refined ({error}).", stacklevel=3)
+        if with_prior:
+            net.prior = or_warn(lambda: learn_prior(net, image.cpu(), X.cpu(), weight.cpu(), random))
     return net
+
+
+def or_warn(learn: Callable[[], Learned]) -> Learned | None:
+    """What `learn` returns; if it fails, a warning and None: a finished training must not be lost by it."""
+    try:
+        return learn()
+    except Exception as error:
+        warnings.warn(f"no shape prior could be learned, so nothing will be refined ({error}).", stacklevel=4)
+        return None
 
 
 def learn_normalizer(
@@ -283,7 +292,7 @@ def learn_normalizer(
 def learn_prior(
     net: DeepNRSfM, image: Tensor, X: Tensor, weight: Tensor, random: torch.Generator | None = None
 ) -> Prior:
-    """The shape prior of some frames, from a trained network's shapes and cameras of at most 4,000 of them.
+    """The shape prior of some frames, from a trained network's shapes and cameras of at most 20,000 of them.
 
     Parameters
     ----------
@@ -294,7 +303,7 @@ def learn_prior(
     random : torch.Generator, optional
         Draws the frames.
     """
-    pick = torch.randperm(len(X), generator=random)[:PRIOR_FRAMES]
+    pick = torch.randperm(len(X), generator=random)[: shape_prior.MOST_FRAMES]
     _, S, M = net.lift(image[pick].to(net.device))
     return shape_prior.learn(X[pick], weight[pick], S.cpu(), M.cpu())
 

@@ -37,7 +37,7 @@ def test_every_method_has_the_same_signature(name):
     assert parameters["visible"].default is None and parameters["confidence"].default is None
     if name != "complete":
         assert parameters["progress"].default is True
-        assert name in ("tomasi_kanade", "pta") or parameters["max_seconds"].default is None
+        assert name in ("tomasi_kanade", "pta", "em_gaussian") or parameters["max_seconds"].default is None
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -21,7 +21,7 @@ PACKAGE = Path(nl.__file__).parent
 _FLOORS = (
     ("checks", "threads"),
     ("data", "sparse_coding", "cameras", "metrics"),
-    ("image_prior", "normalizer", "images", "shape_prior", "weights", "model", "gradient"),
+    ("image_prior", "normalizer", "images", "gaussian", "shape_prior", "weights", "model", "gradient"),
     ("training", "datasets", "baselines", "quality"),
     ("reconstruction",),
     ("plotting",),

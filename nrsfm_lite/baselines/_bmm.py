@@ -98,10 +98,17 @@ def bmm(
     restarts = whole("restarts", restarts, 1, 1000)
     check_cost("bmm", F, 8 * (80 * F * P + 5 * (3 * P) ** 2) / 2**30, 3.5e-6 * F * P**2 + 2e-6 * P**3, max_seconds)
     watch = Watch("bmm", max_seconds, progress)
-    rng = np.random.default_rng(seed)
-    M = unordered_cameras(images.X, rank, watch.steps(restarts, "cameras"), rng)
-    S, converged = _least_nuclear_norm(images.X, M, rank, watch)
+    S, M, converged = shapes_and_cameras(images.X, rank, restarts, watch, seed)
     return images.reconstruction(S, M, method="bmm", converged=converged)
+
+
+def shapes_and_cameras(
+    X: np.ndarray, rank: int, restarts: int, watch: Watch, seed: int
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """`bmm` of centred image points (F, P, 2), all at hand: (F, P, 3), (F, 3, 2), and whether all steps settled."""
+    M = unordered_cameras(X, rank, watch.steps(restarts, "cameras"), np.random.default_rng(seed))
+    S, converged = _least_nuclear_norm(X, M, rank, watch)
+    return S, M, converged
 
 
 def _least_nuclear_norm(X: np.ndarray, M: np.ndarray, rank: int, watch: Watch) -> tuple[np.ndarray, bool]:

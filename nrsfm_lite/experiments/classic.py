@@ -22,7 +22,10 @@ _RANKS = {
 _CAMERA_FRAME = ("cns", "sfc")  # methods without a world frame
 _BY_CHANCE = ("bmm", "cns", "sps", "sfc", "network")  # a seed decides
 _BY_ROUNDING = ("ksta",)  # the seed of noise far below any that a camera has
-_METHODS = ("tomasi_kanade", "pta", "ksta", "bmm", "riks", "riks asfm", "cns", "nlo", "sps", "sfc", "sfc 5", "network")
+_METHODS = (
+    *("tomasi_kanade", "pta", "ksta", "bmm", "riks", "riks asfm", "cns", "nlo", "sps", "sfc", "sfc 5"),
+    *("em_gaussian", "em_gaussian bmm", "network"),
+)
 _SEEDS = 3
 
 
@@ -98,6 +101,8 @@ def _own(method, variant, data):
     own: dict[str, Any] = {"rank": _RANKS[method].get(data, 7)} if method in _RANKS else {}
     if method == "riks":
         own |= {"kernel": variant[0] if variant else "rik", "basis": 0.1 if variant and data == "dance" else 0.2}
+    if method == "em_gaussian":
+        own |= {"start": variant[0] if variant else "rigid"}
     if method == "sfc":
         own |= {"rank": int(variant[0]) if variant else 1}
     return own

@@ -8,7 +8,7 @@ from .lab.process import apart, peak_mb
 
 QUESTION = "How do time and memory of the classical methods grow with the number of frames?"
 _FRAMES = (100, 300, 1000, 3000, 10_500)
-_METHODS = ("tomasi_kanade", "pta", "bmm", "sfc", "ksta", "riks", "cns", "nlo", "sps")
+_METHODS = ("tomasi_kanade", "pta", "bmm", "sfc", "em_gaussian", "ksta", "riks", "cns", "nlo", "sps")
 _LONG = 600  # seconds by a method's own estimate, above which it refuses here; users are granted an hour
 
 

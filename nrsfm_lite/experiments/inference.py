@@ -7,11 +7,12 @@ import torch
 
 from ..model import DeepNRSfM
 from ..reconstruction import reconstruct
-from ..training import PRIOR_FRAMES, learn_prior
+from ..training import learn_prior
 from .lab.process import apart, peak_mb
 
 QUESTION = "How many frames per second does `reconstruct` take in with a trained network, and how much memory?"
 _POINTS = 31
+_PRIOR_FRAMES = 4000
 
 
 def cases(quick: bool) -> list[dict[str, object]]:
@@ -44,7 +45,7 @@ def report(rows: list[dict[str, str]]) -> str:
 def _infer(frames, refine):
     W = np.random.default_rng(0).normal(size=(frames, _POINTS, 2))
     net = DeepNRSfM(n_points=_POINTS).eval()
-    some = torch.as_tensor(W[:PRIOR_FRAMES])
+    some = torch.as_tensor(W[:_PRIOR_FRAMES])
     visible = torch.ones(some.shape[:2], dtype=torch.bool)
     net.prior = learn_prior(net, *net.normalize(some, visible)[:2], visible)  # as `fit` leaves it, all kinds in use
     reconstruct(W[:100], model=net, refine=refine)  # libraries load on first use

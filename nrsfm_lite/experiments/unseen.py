@@ -9,7 +9,7 @@ from ..cameras import nearest_orthonormal, nearness, random_cameras
 from ..images import parse
 from ..model import Config, DeepNRSfM
 from ..threads import use_threads
-from ..training import PRIOR_FRAMES, SCHEDULES, Descent, learn_normalizer
+from ..training import SCHEDULES, Descent, learn_normalizer
 from .lab import scoring
 
 QUESTION = "Which changes of the training, or of the network, help on unseen frames? Would 3D supervision?"
@@ -132,7 +132,7 @@ def _lift(net, X, change):
 def _errors(nets, change, train, test):
     X, S, M = _guess(nets, change, train)
     visible = torch.ones(X.shape[:2], dtype=torch.bool)
-    pick = torch.randperm(len(X), generator=torch.Generator().manual_seed(0))[:PRIOR_FRAMES]
+    pick = torch.randperm(len(X), generator=torch.Generator().manual_seed(0))[: shape_prior.MOST_FRAMES]
     prior = shape_prior.learn(X[pick], visible[pick], S[pick], M[pick])
     result = {"seen": _error(S, train), "refined": _error(shape_prior.apply(prior, X, visible, M)[0], train)}
     X, S, M = _guess(nets, change, test)

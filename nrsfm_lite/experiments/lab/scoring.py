@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ... import datasets, metrics, quality
-from ...data import Landmarks
+from ...data import Landmarks, Reconstruction
 from ...model import Config, DeepNRSfM
 from ...reconstruction import reconstruct
 from ...training import SCHEDULES, Schedule, fit
@@ -106,6 +106,15 @@ def hidden_errors(key: str, S: np.ndarray, frames: Landmarks) -> dict[str, Any]:
         return {key: whole, f"{key}_hidden": ""}
     hidden = metrics.normalized_error(S, frames.points3d, points=~frames.visible)
     return {key: whole, f"{key}_hidden": float(np.nanmean(hidden))}
+
+
+def errors(key: str, rec: Reconstruction, frames: Landmarks) -> dict[str, object]:
+    """Mean normalised error under `key`, with rotations only under `key`_turned, and the share of mirrored frames."""
+    return {
+        key: float(metrics.normalized_error(rec.shapes, frames.points3d).mean()),
+        f"{key}_turned": float(metrics.rotation_only_error(rec.shapes, frames.points3d).mean()),
+        f"{key}_mirrored": metrics.handedness(rec.shapes, frames.points3d).mirrored,
+    }
 
 
 def variants(setting: str, values: Sequence[str], seeds: int, quick: bool) -> list[dict[str, object]]:
