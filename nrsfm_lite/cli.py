@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .data import Landmarks, Reconstruction
 
 _FORMATS = ("npz", "bvh")
+_BANDS = "draw each point's 90 % band in the scene"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -75,12 +76,14 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--steps", type=int, help="training steps")
     make.add_argument("--seed", type=int, default=0, help="decides the training's start and order, and the cameras")
     make.add_argument("--checkpoint", type=Path, help="keep the state here, and go on from it if it exists")
+    make.add_argument("--uncertainty", action="store_true", help=_BANDS)
     make.add_argument("--quiet", action="store_true", help="no progress bar")
     make.set_defaults(run=_reconstruct)
 
     view = commands.add_parser("view", help="a saved reconstruction as a 3D scene")
     view.add_argument("file", type=Path, metavar="RESULT.npz")
     view.add_argument("--out", type=Path, required=True, metavar="SCENE.html")
+    view.add_argument("--uncertainty", action="store_true", help=_BANDS)
     view.set_defaults(run=_view)
 
     experiment = commands.add_parser(
@@ -190,7 +193,9 @@ def _experiment(arguments: argparse.Namespace) -> None:
 def _write_scene(rec: Reconstruction, arguments: argparse.Namespace, truth: np.ndarray | None = None) -> None:
     from . import plotting
 
-    figure = plotting.show3d(rec, truth=truth, max_frames=150, title=arguments.file.name, height=700)
+    figure = plotting.show3d(
+        rec, truth=truth, uncertainty=arguments.uncertainty, max_frames=150, title=arguments.file.name, height=700
+    )
     plotting.write_html(figure, arguments.out)
     print(f"wrote {arguments.out}")
 

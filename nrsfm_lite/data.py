@@ -190,6 +190,10 @@ class Reconstruction:
         What the method was shown.
     names, edges
         As in `Landmarks`.
+    uncertainty : (F, P, 3, 3) or None
+        Covariance of each point about where it was put, in the frame of its camera: the image's two axes, then
+        depth (the cross product of the camera's columns); in squared units of the input (chapter 10). That the whole
+        shape may be mirrored in depth is not in it. None for methods that do not say.
     coherence : float or None
         Mutual coherence of the last dictionary (chapter 10); None for methods without one.
     method : str
@@ -217,6 +221,7 @@ class Reconstruction:
     visible: np.ndarray | None = None
     names: tuple[str, ...] = ()
     edges: np.ndarray = field(default_factory=_no_edges)
+    uncertainty: np.ndarray | None = None
     coherence: float | None = None
     method: str = ""
     converged: bool = True
@@ -235,7 +240,10 @@ class Reconstruction:
             ("cameras", float, (n_frames, 3, 2)),
             ("translations", float, (n_frames, 2)),
             ("visible", bool, (n_frames, n_points)),
+            ("uncertainty", float, (n_frames, n_points, 3, 3)),
         ]:
+            if getattr(self, key) is None:
+                continue
             value = checks.as_array(key, getattr(self, key), dtype)
             checks.check_shape(key, value, expected)
             setattr(self, key, value)

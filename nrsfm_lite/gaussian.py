@@ -26,7 +26,10 @@ _SHIFT = 1.0  # standard deviation of t: anything that a centred frame can need
 _TURN = 1.0  # radians, standard deviation of a camera about which its image says nothing
 _LONGEST_STEP = 0.3  # radians per Newton step
 _DAMPING = 3e-3  # of a Newton step, as a share of the mean curvature
+_ARRIVED = 1e-3  # radians: a Newton step shorter than this is the last
 _CHUNK = 64  # frames per pass, so that their matrices stay in the cache
+_LOST = 6.0  # standard deviations by which a frame misses more than it should, from where on its camera is looked for
+_HOPEFUL_SIDES, _STEPS_FROM_A_SIDE = 6, 3  # of the 24 sides, those that are followed for some Newton steps
 _STEPS_OF_THE_OTHER_HAND = 1, 4  # Newton steps before and after those are dropped that have no chance
 _NO_CHANCE = 150.0  # by which −log p of the other hand is higher
 
@@ -168,29 +171,65 @@ def fit(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor, steps: int) ->
 
 
 def turn(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor, steps: int) -> Tensor:
-    """Cameras after some Newton steps."""
+    """Cameras after at most so many Newton steps; one that has arrived stays."""
     M = M.clone()
     for part in torch.arange(len(X)).split(_CHUNK):
-        x, root_weight, m = X[part], _root_weight(weight[part]), M[part]
+        root_weight = _root_weight(weight[part])
+        i = torch.arange(len(part))  # those that are still on their way
         for _ in range(steps):
-            post = _posterior(gaussian, x, root_weight, m)
-            m = _newton_step(gaussian, post, m, _turns(post, m))
-        M[part] = m
+            m = M[part[i]]
+            post = _posterior(gaussian, X[part[i]], root_weight[i], m)
+            M[part[i]] = _newton_step(gaussian, post, m, _turns(post, m))
+            i = i[(M[part[i]] - m).flatten(1).norm(dim=1) > _ARRIVED]
+            if not len(i):
+                break
     return M
+
+
+def find(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor, steps: int) -> tuple[Tensor, Tensor]:
+    """Most probable shapes and cameras, as `fit`; a camera that is lost is looked for from all sides.
+
+    Under the Gaussian, the squared distance of an image from the mean has a known distribution. A frame that is far
+    outside it has ended in a wrong minimum, or does not belong here. It starts once more from 24 sides.
+    """
+    M = turn(gaussian, X, weight, M, steps)
+    count = 2 * (weight > 0).sum(1)
+    lost = ((_likelihood(gaussian, X, weight, M)[0] - count) > _LOST * (2 * count).sqrt()).nonzero()[:, 0]
+    if len(lost):
+        x, some, every = X[lost], weight[lost], torch.arange(len(lost))
+        sides = _sides()[:, None].expand(-1, len(lost), 3, 2)
+        value = torch.stack([negative_log_likelihood(gaussian, x, some, m) for m in sides])
+        hopeful = value.topk(_HOPEFUL_SIDES, 0, largest=False).indices
+        tried = [M[lost], *(turn(gaussian, x, some, sides[k, every], _STEPS_FROM_A_SIDE) for k in hopeful)]
+        value = torch.stack([negative_log_likelihood(gaussian, x, some, m) for m in tried])
+        M[lost] = turn(gaussian, x, some, torch.stack(tried)[value.argmin(0), every], steps)
+    return fit(gaussian, X, weight, M, 0)
+
+
+def _sides():
+    """Cameras (24, 3, 2) along the axes: every pair of two of them, in both directions."""
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).double()
+    return torch.stack([torch.stack([a, b], 1) for a in axes for b in axes if a @ b == 0])
 
 
 def negative_log_likelihood(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
     """−log p(image | camera) of each frame (B,), the cameras as they are."""
-    result = torch.empty(len(X), dtype=X.dtype)
+    return _likelihood(gaussian, X, weight, M)[1]
+
+
+def _likelihood(gaussian, X, weight, M):
+    """Squared distance of each image from the mean, in standard deviations, and −log p of the image: (B,) each."""
+    distance, result = (torch.empty(len(X), dtype=X.dtype) for _ in range(2))
     for part in torch.arange(len(X)).split(_CHUNK):
         root_weight = _root_weight(weight[part])
         y, _, factor = _marginal(gaussian, X[part], root_weight, M[part])
         half = torch.linalg.solve_triangular(factor, y[..., None], upper=False)
+        distance[part] = half.square().sum((1, 2))
         hidden = root_weight == 0
         logs = factor.diagonal(dim1=1, dim2=2).log() - root_weight.masked_fill(hidden, gaussian.noise**0.5).log()
         count = (~hidden).double().sum(1)
-        result[part] = half.square().sum((1, 2)) / 2 + logs.sum(1) + count * math.log(2 * math.pi) / 2
-    return result
+        result[part] = distance[part] / 2 + logs.sum(1) + count * math.log(2 * math.pi) / 2
+    return distance, result
 
 
 def negative_log_evidence(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
@@ -225,8 +264,7 @@ def right_hand(
     S, M, and for each frame (B,) whether it was mirrored, and by how much −log p of the other hand was higher; the
     other hand of a frame that had no chance was not refined to its end.
     """
-    depth = torch.linalg.cross(M[..., 0], M[..., 1])
-    mirrored = S @ torch.cat([M, -depth[..., None]], 2)  # as the camera sees it, depth with the other sign
+    mirrored = S @ with_depth(M) * torch.tensor([1, 1, -1])  # as the camera sees it, depth with the other sign
     U, _, Vh = torch.linalg.svd(gaussian.mean.T @ mirrored)
     sign = torch.linalg.det(U @ Vh)
     turned = (torch.cat([U[..., :2], U[..., 2:] * sign[:, None, None]], 2) @ Vh)[..., :2]
@@ -241,6 +279,36 @@ def right_hand(
     S, M, better = S.clone(), M.clone(), flipped[i]
     S[i[better]], M[i[better]] = other_S[better], other_M[better]
     return S, M, flipped, higher.abs()
+
+
+def doubt(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
+    """Covariances (B, P, 3, 3) of the points, in the frame of each one's camera, whose third axis is the depth.
+
+    What an image leaves open of its shape, and what its camera's own doubt adds: by Laplace's method, J H⁻¹ Jᵀ with J
+    how the shape, as the camera sees it, follows a turn of the camera, and H the Fisher information about the turn.
+    """
+    B, P, _ = X.shape
+    result = torch.empty(B, P, 3, 3, dtype=X.dtype)
+    axes = torch.eye(3, dtype=X.dtype).view(1, 3, 1, 3)
+    for part in torch.arange(B).split(_CHUNK):
+        post = _posterior(gaussian, X[part], _root_weight(weight[part]), M[part])
+        rows = with_depth(M[part]).mT  # (b, 3, 3)
+        pairs = (rows[:, :, None, :, None] * rows[:, None, :, None, :]).reshape(-1, 9, 9)
+        C = _join(pairs @ _split(gaussian.covariance), 3)  # as the camera sees it: (b, 3P, 3P)
+        seen = C[:, : 2 * P]
+        within = C.view(-1, 3, P, 3, P).diagonal(dim1=2, dim2=4)  # (b, 3, 3, P)
+        told = torch.einsum("brip,brjp->bijp", seen.unflatten(2, (3, P)), (post.precision @ seen).unflatten(2, (3, P)))
+        moved = (torch.linalg.cross(axes, rows[:, None]) @ post.shapes.mT[:, None]).flatten(2)  # (b, 3 axes, 3P)
+        follows = moved - moved[..., : 2 * P] @ post.precision @ seen  # the shape gives way to the turn
+        turns = _turns(post, M[part])
+        follows = torch.linalg.solve_triangular(turns.factor, follows, upper=False).unflatten(2, (3, P))
+        result[part] = (within - told + torch.einsum("baip,bajp->bijp", follows, follows)).permute(0, 3, 1, 2)
+    return result
+
+
+def with_depth(M: Tensor) -> Tensor:
+    """Cameras (B, 3, 2) with the viewing direction as a third column: rotations (B, 3, 3)."""
+    return torch.cat([M, torch.linalg.cross(M[..., 0], M[..., 1])[..., None]], 2)
 
 
 @dataclass(frozen=True)
@@ -295,7 +363,8 @@ class _Turns:
     """What turning the camera about each axis does to some images."""
 
     curvature: torch.Tensor  # (B, 3, 3): Fisher information about the camera, never negative
-    doubt: torch.Tensor  # (B, 3, 2P): L⁻¹ J √Ω Σ⁻¹ √Ω with J how an image moves, L Lᵀ the curvature and its prior
+    factor: torch.Tensor  # (B, 3, 3): Cholesky factor L of the curvature with its prior
+    doubt: torch.Tensor  # (B, 3, 2P): L⁻¹ J √Ω Σ⁻¹ √Ω with J how an image moves
 
 
 def _turns(post, M):
@@ -305,7 +374,7 @@ def _turns(post, M):
     weighted = J @ post.precision
     curvature = weighted @ J.mT
     factor = torch.linalg.cholesky(curvature + torch.eye(3, dtype=M.dtype) / _TURN**2)
-    return _Turns(curvature, torch.linalg.solve_triangular(factor, weighted, upper=False))
+    return _Turns(curvature, factor, torch.linalg.solve_triangular(factor, weighted, upper=False))
 
 
 def _newton_step(gaussian, post, M, turns):

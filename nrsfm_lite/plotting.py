@@ -13,13 +13,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from . import checks, images
+from .cameras import rotations
 from .data import Landmarks, Reconstruction
 from .metrics import align
 
 # Readable on white and on black, and for readers who do not tell red from green.
 PREDICTED, TRUE, SEEN = "#e8702a", "#7f8fa6", "#2a9d8f"
 INK = "#767676"  # text and axes
-_PREDICTED_NAME, _TRUE_NAME = "reconstruction", "truth"
+_PREDICTED_NAME, _TRUE_NAME, _BAND_NAME = "reconstruction", "truth", "90 % band"
+_BAND = 1.645  # standard deviations to either side that hold 90 %
 
 
 def use_style() -> None:
@@ -47,6 +49,7 @@ def show3d(
     truth: Any = None,
     edges: Any = None,
     *,
+    uncertainty: bool = False,
     max_frames: int = 60,
     up: Any = None,
     title: str | None = None,
@@ -62,6 +65,9 @@ def show3d(
         mirror images allowed), since a reconstruction is known only up to that.
     edges : (E, 2) int, optional
         Default: those of `shapes` or `truth`.
+    uncertainty : bool
+        Show how far each point may be off: a bar along its most doubtful direction, in which it lies with a probability
+        of 90 %. For a Reconstruction that has one.
     max_frames : int
         A longer motion is thinned out evenly, to keep pages small.
     up : (3,), optional
@@ -79,8 +85,8 @@ def show3d(
     Raises
     ------
     ValueError
-        If there are no 3D points or no frames, if a value is not finite, if `shapes` and `truth` differ in
-        shape, or if an edge refers to a point that is not there.
+        If there are no 3D points or no frames, no uncertainty to show, or a value that is not finite; if `shapes`
+        and `truth` differ in shape, or if an edge refers to a point that is not there.
 
     Examples
     --------
@@ -90,6 +96,8 @@ def show3d(
     """
     max_frames, height = checks.whole("max_frames", max_frames, 1), checks.whole("height", height, 1)
     points, own_edges = _points(shapes, "shapes")
+    bars = _bars(shapes) if checks.truth("uncertainty", uncertainty) else None
+    centred = points - points.mean(1, keepdims=True)
     if truth is not None:
         true_points, true_edges = _points(truth, "truth")
         if true_points.shape != points.shape:
@@ -98,7 +106,7 @@ def show3d(
         own_edges = own_edges if len(own_edges) else true_edges
     else:
         true_points = None
-        points = points - points.mean(1, keepdims=True)
+        points = centred
     edges = own_edges if edges is None else checks.as_edges("edges", edges, points.shape[1])
     if up is not None:
         up = checks.as_array("up", up, float)
@@ -111,9 +119,14 @@ def show3d(
     chosen = _spread(len(points), max_frames)
     layers = [] if true_points is None else [(true_points @ turn, TRUE, _TRUE_NAME)]
     layers.append((points @ turn, PREDICTED, _PREDICTED_NAME if true_points is not None else "shape"))
+    ends = None
+    if bars is not None:
+        moved = bars @ (np.linalg.pinv(centred) @ (points - points.mean(1, keepdims=True)) @ turn)  # as the shape was
+        ends = np.stack([layers[-1][0] - moved, layers[-1][0] + moved], 2)  # (F, P, 2, 3)
 
     def traces(f):
-        return [trace for S, colour, name in layers for trace in _body(S[f], edges, colour, name)]
+        bodies = [trace for S, colour, name in layers for trace in _body(S[f], edges, colour, name)]
+        return bodies if ends is None else [*bodies, _bar(ends[f], PREDICTED)]
 
     figure = go.Figure(data=traces(chosen[0]), frames=[go.Frame(data=traces(f), name=str(f)) for f in chosen])
     reach = 1.05 * max(np.abs(S[chosen]).max() for S, _, _ in layers)
@@ -291,6 +304,21 @@ def _points(source, argument):
         raise ValueError(f"{argument} has shape {points.shape}; expected (F, P, 3) with at least one frame.")
     checks.check_finite(argument, points)
     return points, edges
+
+
+def _bars(rec):
+    """Half of each point's 90 % band along its most doubtful direction: vectors (F, P, 3) in the world."""
+    if not isinstance(rec, Reconstruction) or rec.uncertainty is None:
+        raise ValueError("uncertainty=True needs a Reconstruction that has one, such as `reconstruct` makes.")
+    values, vectors = np.linalg.eigh(rec.uncertainty)
+    half = _BAND * np.sqrt(np.maximum(values[..., -1:], 0)) * vectors[..., -1]
+    return half @ rotations(rec.cameras).swapaxes(1, 2)
+
+
+def _bar(ends, colour):
+    x, y, z = _segments(ends.reshape(-1, 3), np.arange(2 * len(ends)).reshape(-1, 2)).astype(np.float32).T
+    return go.Scatter3d(x=x, y=y, z=z, mode="lines", line=dict(color=colour, width=2), opacity=0.5,
+                        name=_BAND_NAME, hoverinfo="skip")  # fmt: skip
 
 
 def _in_one_pose(points):

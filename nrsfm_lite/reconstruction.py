@@ -121,18 +121,18 @@ def reconstruct(
             raise ValueError(f"model was trained for {model.config.n_points} points, but W has {images.n_points}.")
     with use_threads(1):  # as in `fit`: never slow on a busy machine, and the same result everywhere
         how: Prior | str | None = "code" if refine == "code" else None
-        cameras = None
         if refine is True:
             how = model.prior
             if anew or (how is None and not trained):  # else `train` has said why there is none
-                found = (
+                how = (
                     or_warn(lambda: _learn_prior(model, images, seed)) if trained else _learn_prior(model, images, seed)
                 )
-                how, cameras = found or (None, None)
             if trained:
                 model.prior = how
-        S, M, t = _infer(model, images, how, progress, cameras)
-    return images.reconstruction(S, M, t, scale=1.0, method="deep_nrsfm", coherence=model.coherence, model=model)
+        S, M, t, doubt = _infer(model, images, how, progress)
+    return images.reconstruction(
+        S, M, t, scale=1.0, uncertainty=doubt, method="deep_nrsfm", coherence=model.coherence, model=model
+    )
 
 
 def _check_given(model: DeepNRSfM, **training: Any) -> None:
@@ -152,37 +152,41 @@ def _check_same(model: DeepNRSfM, **settings: Any) -> None:
             raise ValueError(f"model was trained for {name}={own!r}, not {value!r}.")
 
 
-def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> tuple[Prior, Tensor | None]:
-    """The shape prior of these frames; of few frames also cameras to start from, for then the network may be wrong."""
+def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> Prior:
+    """The shape prior of these frames; of few frames from the best of several starts, for the network may be wrong."""
     X, mean, weight = images.tensors(device=model.device)
     image, X, _ = model.normalizer.normalize(X, mean, weight)
     if len(images) > _FEW:
-        return learn_prior(model, image, X.cpu(), weight.cpu(), torch.Generator().manual_seed(seed)), None
+        return learn_prior(model, image, X.cpu(), weight.cpu(), torch.Generator().manual_seed(seed))
     with torch.no_grad():
         _, S, M = model.lift(image)
     X, weight, image, S, M = X.cpu(), weight.cpu(), image.double().cpu(), S.double().cpu(), M.double().cpu()
     starts = [(S, M)]
-    for other_S, other_M in baselines.starts(image.numpy(), seed):
+    # In single precision: the last digits of another unit of length are gone, which can decide between two minima.
+    for other_S, other_M in baselines.starts(image.float().double().numpy(), seed):
         # Into the network's world, so that its cameras of other frames remain a start for this prior.
         U, _, Vh = torch.linalg.svd(torch.einsum("fij,fkj->ik", M, torch.as_tensor(other_M)))
         starts.append((torch.as_tensor(other_S) @ (U @ Vh).mT, U @ Vh @ torch.as_tensor(other_M)))
     S, M = starts[shape_prior.choose(X, weight, starts)]
-    return shape_prior.learn(X, weight, S, M), M
+    return shape_prior.learn(X, weight, S, M)
 
 
 def _infer(
-    model: DeepNRSfM, images: Images, how: Prior | str | None, progress: bool, cameras: Tensor | None = None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Shapes, cameras and translations of all frames, in the user's units, chunk by chunk."""
+    model: DeepNRSfM, images: Images, how: Prior | str | None, progress: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Shapes, cameras, translations and uncertainty of all frames, in the user's units, chunk by chunk."""
     F, P = images.weight.shape
-    S, M, t = np.empty((F, P, 3)), np.empty((F, 3, 2)), np.empty((F, 2))
+    S, M, t, doubt = np.empty((F, P, 3)), np.empty((F, 3, 2)), np.empty((F, 2)), None
+    if how is not None and not isinstance(how, str):
+        doubt = np.empty((F, P, 3, 3))
     with tqdm(total=F, desc="refining", unit="frame", disable=not (progress and how), mininterval=0.5) as bar:
         for first in range(0, F, _CHUNK):
             part = slice(first, first + _CHUNK)
-            start = None if cameras is None else cameras[part]
-            S[part], M[part], t[part] = infer(model, *images.tensors(part, model.device), how, start)
+            S[part], M[part], t[part], each = infer(model, *images.tensors(part, model.device), how)
+            if doubt is not None:
+                doubt[part] = each
             bar.update(len(S[part]))
-    return S, M, t
+    return S, M, t, doubt
 
 
 def infer(
@@ -191,9 +195,8 @@ def infer(
     mean: Tensor,
     weight: Tensor,
     how: Prior | str | None = None,
-    cameras: Tensor | None = None,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Shapes, cameras and translations of some frames by a trained network, in double precision at the end.
+) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
+    """What a trained network makes of some frames, and the refinement of it; in double precision at the end.
 
     Parameters
     ----------
@@ -201,19 +204,20 @@ def infer(
     W, mean, weight : double tensors (B, P, 2), (B, 2) and (B, P) where the model is
         Centred image points, what was subtracted, and how much each point counts.
     how : shape prior (as `shape_prior.learn` returns it), "code" or None
-    cameras : (B, 3, 2) tensor, optional
-        From where a shape prior starts. Default: the network's.
         How to go on from the network's guess.
 
     Returns
     -------
-    S (B, P, 3) centred, M (B, 3, 2), t (B, 2) beyond the mean: tensors on the CPU in the units of W.
+    S (B, P, 3) centred, M (B, 3, 2), t (B, 2) beyond the mean, and, from a shape prior, covariances (B, P, 3, 3) of the
+    points: tensors on the CPU in the units of W.
     """
     image, X, unit = model.normalizer.normalize(W, mean, weight)
     with torch.no_grad():
         psi, S, M = model.lift(image)
+    doubt = None
     if how is not None and not isinstance(how, str):
-        S, M = shape_prior.apply(how, X.cpu(), weight.cpu(), M.cpu() if cameras is None else cameras)
+        S, M = shape_prior.apply(how, X.cpu(), weight.cpu(), M.cpu())
+        doubt = shape_prior.uncertainty(how, X.cpu(), weight.cpu(), S, M) * unit.cpu()[:, None, None, None] ** 2
     elif how == "code":
         psi, M = _refine_code(model, X.to(model.dtype), weight, psi, M)
         with torch.no_grad():
@@ -221,7 +225,7 @@ def infer(
     # A float32 camera is orthonormal to 1e-7; once more in double precision costs nothing.
     S, M = S.double().cpu(), nearest_orthonormal(M.detach().double().cpu())
     S = (S - S.mean(1, keepdim=True)) * unit[:, None, None].cpu()
-    return S, M, normalizer.weighted_mean(W.cpu() - S @ M, weight.cpu())
+    return S, M, normalizer.weighted_mean(W.cpu() - S @ M, weight.cpu()), doubt
 
 
 def _refine_code(model: DeepNRSfM, X: Tensor, weight: Tensor, psi: Tensor, M: Tensor) -> tuple[Tensor, Tensor]:

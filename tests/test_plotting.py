@@ -174,3 +174,14 @@ def test_an_exported_scene_is_one_page_that_asks_nobody(motion, tmp_path):
     assert "<title>&lt;walk&gt;</title>" in page and 'name="viewport"' in page
     assert not re.findall(r"""<(?:script|link|img)[^>]+(?:src|href)=["']?(?:https?:)?//""", page)
     assert len(page) < 8e6
+
+
+def test_bands_are_as_long_as_they_say_and_refused_where_there_are_none():
+    views = nl.datasets.make_views(nl.datasets.make_motion(50))
+    rec = nl.baselines.em_gaussian(views, progress=False)
+    x, y, z = (np.asarray(getattr(nl.plotting.show3d(rec, uncertainty=True).data[-1], k)) for k in "xyz")
+    ends = np.stack([x, y, z], 1)
+    longest = 2 * 1.645 * np.sqrt(np.linalg.eigvalsh(rec.uncertainty[0])[:, -1])
+    np.testing.assert_allclose(np.linalg.norm(ends[1::3] - ends[::3], axis=1), longest, rtol=1e-3)
+    with pytest.raises(ValueError, match="uncertainty"):
+        nl.plotting.show3d(nl.baselines.tomasi_kanade(views), uncertainty=True)

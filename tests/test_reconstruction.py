@@ -148,7 +148,7 @@ def test_a_wrong_point_without_confidence_does_not_matter(views, rec):
     W, confidence = views.points2d.copy(), np.ones((600, 31))
     W[::2, 5] += 1.0  # far off
     trusted = nl.reconstruct(W, model=rec.model)
-    confidence[::2, 5] = 1e-4
+    confidence[::2, 5] = 1e-5  # the prior's noise, a few thousandths of a body, is then as large as the body
     doubted = nl.reconstruct(W, model=rec.model, confidence=confidence)
     confidence[::2, 5] = 0
     hidden = nl.reconstruct(W, model=rec.model, confidence=confidence)
@@ -243,3 +243,27 @@ def test_refining_shows_its_progress(views, rec, capsys):
     assert "refining" in capsys.readouterr().err
     nl.reconstruct(views, model=rec.model, progress=False)
     assert not capsys.readouterr().err
+
+
+def test_uncertainty_covers_the_depths_and_moves_with_the_unit(views):
+    views = views[::4]
+    rec = nl.reconstruct(views, steps=30, progress=False)
+    z, true = (
+        nl.cameras.camera_frame(S - S.mean(1, keepdims=True), M)[..., 2]
+        for S, M in ((rec.shapes, rec.cameras), (views.points3d, views.cameras))
+    )
+    off = np.abs(np.sign((z * true).sum()) * z - true)
+    half = 1.645 * np.sqrt(rec.uncertainty[..., 2, 2])
+    assert 0.7 < (off < half).mean() < 0.995 and 2 * np.median(half) < 0.3 * np.std(true)
+    assert nl.reconstruct(views, model=rec.model, refine=False).uncertainty is None
+    larger = nl.reconstruct(64 * views.points2d, steps=30, progress=False)
+    np.testing.assert_allclose(larger.uncertainty, 64**2 * rec.uncertainty, rtol=1e-6)
+
+
+def test_a_network_that_knows_nothing_does_not_spoil_the_refinement(views, rec):
+    bare = nl.DeepNRSfM(n_points=31, generator=torch.Generator().manual_seed(0)).eval()
+    bare.normalizer, bare.prior = rec.model.normalizer, rec.model.prior
+    lost = nl.reconstruct(views, model=bare, refine=False)
+    found = nl.reconstruct(views, model=bare)
+    errors = [nl.metrics.normalized_error(r.shapes, views.points3d).mean() for r in (lost, found, rec)]
+    assert errors[0] > 10 * errors[1] and errors[1] < 1.5 * errors[2]

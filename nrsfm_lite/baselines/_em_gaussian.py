@@ -61,7 +61,7 @@ def em_gaussian(
 
     Returns
     -------
-    Reconstruction in one world frame for all frames, in the units of W.
+    Reconstruction in one world frame for all frames, in the units of W, with each point's uncertainty.
 
     Raises
     ------
@@ -102,7 +102,10 @@ def em_gaussian(
     prior = shape_prior.learn(X, weight, torch.as_tensor(S), cameras)
     found, cameras = shape_prior.apply(prior, X, weight, cameras)
     t = ((X - found @ cameras) * weight[..., None]).sum(1) / weight.sum(1, keepdim=True)
-    return images.reconstruction(found.numpy(), cameras.numpy(), t.numpy(), method="em_gaussian")
+    doubt = shape_prior.uncertainty(prior, X, weight, found, cameras) * images.scale**2
+    return images.reconstruction(
+        found.numpy(), cameras.numpy(), t.numpy(), uncertainty=doubt.numpy(), method="em_gaussian"
+    )
 
 
 @one_thread
