@@ -240,10 +240,8 @@ class Reconstruction:
             ("cameras", float, (n_frames, 3, 2)),
             ("translations", float, (n_frames, 2)),
             ("visible", bool, (n_frames, n_points)),
-            ("uncertainty", float, (n_frames, n_points, 3, 3)),
+            *([("uncertainty", float, (n_frames, n_points, 3, 3))] if self.uncertainty is not None else []),
         ]:
-            if getattr(self, key) is None:
-                continue
             value = checks.as_array(key, getattr(self, key), dtype)
             checks.check_shape(key, value, expected)
             setattr(self, key, value)

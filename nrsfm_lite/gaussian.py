@@ -293,8 +293,7 @@ def doubt(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
     for part in torch.arange(B).split(_CHUNK):
         post = _posterior(gaussian, X[part], _root_weight(weight[part]), M[part])
         rows = with_depth(M[part]).mT  # (b, 3, 3)
-        pairs = (rows[:, :, None, :, None] * rows[:, None, :, None, :]).reshape(-1, 9, 9)
-        C = _join(pairs @ _split(gaussian.covariance), 3)  # as the camera sees it: (b, 3P, 3P)
+        C = _join(_pairs(rows) @ _split(gaussian.covariance), 3)  # as the camera sees it: (b, 3P, 3P)
         seen = C[:, : 2 * P]
         within = C.view(-1, 3, P, 3, P).diagonal(dim1=2, dim2=4)  # (b, 3, 3, P)
         told = torch.einsum("brip,brjp->bijp", seen.unflatten(2, (3, P)), (post.precision @ seen).unflatten(2, (3, P)))
@@ -329,13 +328,18 @@ def _marginal(gaussian, X, root_weight, M):
     """
     B, P, _ = X.shape
     y = (X - gaussian.mean @ M).mT.reshape(B, 2 * P) * root_weight
-    pairs = (M.mT[:, :, None, :, None] * M.mT[:, None, :, None, :]).reshape(B, 4, 9)
+    pairs = _pairs(M.mT)
     Sigma = _join(pairs @ _split(gaussian.covariance), 2)
     Sigma += _SHIFT**2 * torch.eye(2, dtype=X.dtype).kron(torch.ones(P, P, dtype=X.dtype))
     if not (root_weight == 1).all():
         Sigma = Sigma * (root_weight[:, :, None] * root_weight[:, None])
     Sigma.diagonal(dim1=1, dim2=2).add_(gaussian.noise)
     return y, pairs, torch.linalg.cholesky(Sigma)
+
+
+def _pairs(rows):
+    """Products of two entries of a camera's rows (B, n, 3), one for each block of C: (B, n², 9)."""
+    return (rows[:, :, None, :, None] * rows[:, None, :, None, :]).flatten(3).flatten(1, 2)
 
 
 def _posterior(gaussian, X, root_weight, M):

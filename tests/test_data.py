@@ -109,6 +109,8 @@ def test_wrong_reconstructions_are_refused(rng, landmarks, tmp_path):
         nl.Reconstruction(np.zeros((3, 5, 2)), np.zeros((3, 3, 2)))
     with pytest.raises(ValueError, match="cameras has shape"):
         nl.Reconstruction(np.zeros((3, 5, 3)), np.zeros((2, 3, 2)))
+    with pytest.raises(ValueError, match="cameras"):
+        nl.Reconstruction(np.zeros((3, 5, 3)), None)
     with pytest.raises(ValueError, match="outside 0 … 4"):
         nl.Reconstruction(np.zeros((3, 5, 3)), np.zeros((3, 3, 2)), edges=[(0, 5)])
     landmarks.save(tmp_path / "l.npz")

@@ -12,6 +12,7 @@ from ..cameras import random_cameras
 from ..checks import one_of, truth, whole
 from ..data import Reconstruction
 from ..images import Images, read
+from ..normalizer import weighted_mean
 from ..threads import one_thread
 from ._bmm import shapes_and_cameras
 from ._tomasi_kanade import factorise
@@ -101,7 +102,7 @@ def em_gaussian(
     cameras = torch.as_tensor(M)
     prior = shape_prior.learn(X, weight, torch.as_tensor(S), cameras)
     found, cameras = shape_prior.apply(prior, X, weight, cameras)
-    t = ((X - found @ cameras) * weight[..., None]).sum(1) / weight.sum(1, keepdim=True)
+    t = weighted_mean(X - found @ cameras, weight)
     doubt = shape_prior.uncertainty(prior, X, weight, found, cameras) * images.scale**2
     return images.reconstruction(
         found.numpy(), cameras.numpy(), t.numpy(), uncertainty=doubt.numpy(), method="em_gaussian"
