@@ -26,9 +26,8 @@ _SHIFT = 1.0  # standard deviation of t: anything that a centred frame can need
 _TURN = 1.0  # radians, standard deviation of a camera about which its image says nothing
 _LONGEST_STEP = 0.3  # radians per Newton step
 _DAMPING = 3e-3  # of a Newton step, as a share of the mean curvature
-_ARRIVED = 1e-3  # radians: a Newton step shorter than this is the last
+_ARRIVED = 3e-3  # radians: a Newton step shorter than this is the last
 _CHUNK = 64  # frames per pass, so that their matrices stay in the cache
-_LOST = 6.0  # standard deviations by which a frame misses more than it should, from where on its camera is looked for
 _HOPEFUL_SIDES, _STEPS_FROM_A_SIDE = 6, 3  # of the 24 sides, those that are followed for some Newton steps
 _STEPS_OF_THE_OTHER_HAND = 1, 4  # Newton steps before and after those are dropped that have no chance
 _NO_CHANCE = 150.0  # by which −log p of the other hand is higher
@@ -173,37 +172,25 @@ def fit(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor, steps: int) ->
 def turn(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor, steps: int) -> Tensor:
     """Cameras after at most so many Newton steps; one that has arrived stays."""
     M = M.clone()
-    for part in torch.arange(len(X)).split(_CHUNK):
-        root_weight = _root_weight(weight[part])
-        i = torch.arange(len(part))  # those that are still on their way
-        for _ in range(steps):
-            m = M[part[i]]
-            post = _posterior(gaussian, X[part[i]], root_weight[i], m)
-            M[part[i]] = _newton_step(gaussian, post, m, _turns(post, m))
-            i = i[(M[part[i]] - m).flatten(1).norm(dim=1) > _ARRIVED]
-            if not len(i):
-                break
+    away = torch.arange(len(X))  # those that are still on their way
+    for _ in range(steps):
+        before = M[away]
+        for i in away.split(_CHUNK):
+            post = _posterior(gaussian, X[i], _root_weight(weight[i]), M[i])
+            M[i] = _newton_step(gaussian, post, M[i], _turns(post, M[i]))
+        away = away[(M[away] - before).flatten(1).norm(dim=1) > _ARRIVED]
     return M
 
 
-def find(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor, steps: int) -> tuple[Tensor, Tensor]:
-    """Most probable shapes and cameras, as `fit`; a camera that is lost is looked for from all sides.
-
-    Under the Gaussian, the squared distance of an image from the mean has a known distribution. A frame that is far
-    outside it has ended in a wrong minimum, or does not belong here. It starts once more from 24 sides.
-    """
-    M = turn(gaussian, X, weight, M, steps)
-    count = 2 * (weight > 0).sum(1)
-    lost = ((_likelihood(gaussian, X, weight, M)[0] - count) > _LOST * (2 * count).sqrt()).nonzero()[:, 0]
-    if len(lost):
-        x, some, every = X[lost], weight[lost], torch.arange(len(lost))
-        sides = _sides()[:, None].expand(-1, len(lost), 3, 2)
-        value = torch.stack([negative_log_likelihood(gaussian, x, some, m) for m in sides])
-        hopeful = value.topk(_HOPEFUL_SIDES, 0, largest=False).indices
-        tried = [M[lost], *(turn(gaussian, x, some, sides[k, every], _STEPS_FROM_A_SIDE) for k in hopeful)]
-        value = torch.stack([negative_log_likelihood(gaussian, x, some, m) for m in tried])
-        M[lost] = turn(gaussian, x, some, torch.stack(tried)[value.argmin(0), every], steps)
-    return fit(gaussian, X, weight, M, 0)
+def search(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
+    """Cameras from all sides: of those that some Newton steps reach, and M, the likeliest of each frame."""
+    every = torch.arange(len(X))
+    sides = _sides()[:, None].expand(-1, len(X), 3, 2)
+    value = torch.stack([negative_log_likelihood(gaussian, X, weight, m) for m in sides])
+    hopeful = value.topk(_HOPEFUL_SIDES, 0, largest=False).indices
+    tried = [M, *(turn(gaussian, X, weight, sides[k, every], _STEPS_FROM_A_SIDE) for k in hopeful)]
+    value = torch.stack([negative_log_likelihood(gaussian, X, weight, m) for m in tried])
+    return torch.stack(tried)[value.argmin(0), every]
 
 
 def _sides():
@@ -215,6 +202,16 @@ def _sides():
 def negative_log_likelihood(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
     """−log p(image | camera) of each frame (B,), the cameras as they are."""
     return _likelihood(gaussian, X, weight, M)[1]
+
+
+def astray(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
+    """By how many standard deviations each image (B,) is farther from the mean than it should be.
+
+    Under the Gaussian, the squared distance of an image has a known distribution. A frame that is far outside it has a
+    camera that has ended in a wrong minimum, or does not belong here.
+    """
+    count = 2 * (weight > 0).sum(1)
+    return (_likelihood(gaussian, X, weight, M)[0] - count) / (2 * count).sqrt()
 
 
 def _likelihood(gaussian, X, weight, M):
@@ -281,17 +278,20 @@ def right_hand(
     return S, M, flipped, higher.abs()
 
 
-def doubt(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
-    """Covariances (B, P, 3, 3) of the points, in the frame of each one's camera, whose third axis is the depth.
+def doubt(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Tensor, Tensor]:
+    """Most probable shapes (B, P, 3), and how far each point may be off: covariances (B, P, 3, 3).
+
+    They are in the frame of each one's camera, whose third axis is the depth.
 
     What an image leaves open of its shape, and what its camera's own doubt adds: by Laplace's method, J H⁻¹ Jᵀ with J
     how the shape, as the camera sees it, follows a turn of the camera, and H the Fisher information about the turn.
     """
     B, P, _ = X.shape
-    result = torch.empty(B, P, 3, 3, dtype=X.dtype)
+    S, result = torch.empty(B, P, 3, dtype=X.dtype), torch.empty(B, P, 3, 3, dtype=X.dtype)
     axes = torch.eye(3, dtype=X.dtype).view(1, 3, 1, 3)
     for part in torch.arange(B).split(_CHUNK):
         post = _posterior(gaussian, X[part], _root_weight(weight[part]), M[part])
+        S[part] = post.shapes
         rows = with_depth(M[part]).mT  # (b, 3, 3)
         C = _join(_pairs(rows) @ _split(gaussian.covariance), 3)  # as the camera sees it: (b, 3P, 3P)
         seen = C[:, : 2 * P]
@@ -302,7 +302,7 @@ def doubt(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
         turns = _turns(post, M[part])
         follows = torch.linalg.solve_triangular(turns.factor, follows, upper=False).unflatten(2, (3, P))
         result[part] = (within - told + torch.einsum("baip,bajp->bijp", follows, follows)).permute(0, 3, 1, 2)
-    return result
+    return S, result
 
 
 def with_depth(M: Tensor) -> Tensor:

@@ -22,13 +22,15 @@ from torch import Tensor
 
 from .gaussian import (
     Gaussian,
+    astray,
     covariance,
     doubt,
-    find,
     fit,
     maximise,
     negative_log_evidence,
     right_hand,
+    search,
+    turn,
     with_depth,
     without_noise,
 )
@@ -36,7 +38,7 @@ from .gaussian import negative_log_likelihood as of_each_frame
 
 MOST_FRAMES = 20_000  # that `learn` takes a look at
 _KEPT_BACK, _LEAST_KEPT_BACK = 300, 20  # frames, for decisions: a tenth, at most and at least so many
-_FRAMES_OF_THE_WHOLE = 4000  # more add little to one Gaussian
+_FRAMES_OF_THE_WHOLE = 2000  # more add little to one Gaussian
 _FRAMES_OF_A_TRIAL = 800
 _FRAMES_PER_COMPONENT = 250  # on average, at least
 _ROUNDS, _ITERATIONS_OF_A_ROUND = 4, 4  # of the whole; between rounds mirrored frames are repaired
@@ -45,11 +47,14 @@ _RIGID = 16  # components of rank zero to begin with, at most, before those that
 _FRAMES_PER_RIGID = 25  # on average, at least, to begin with
 _HOPELESS = 0.5  # by which −log p per coordinate is above the best, so that nothing of the kind is tried any further
 _ALIKE = 4e-3  # by which joining two components may raise −log p per coordinate
-_NEAREST = 4  # components whose likelihood is asked for, by the distance of their means
+_BORROWED, _SHARE_OF_THE_WIDER = 0.3, 0.1  # of the pooled covariance in a wider twin, and how many frames need one
+_NEAREST = 8  # components whose likelihood is asked for, by the distance of their means
 _NEWTON_STEPS = 12  # of a frame's camera, at most
 _LEAST_SHARE = 0.01  # of a component in a frame, to count for its uncertainty
 _STEPS_OF_ANOTHER = 2  # Newton steps from one component's camera to another's
-_WIDER = 1.4  # bands, so that nine of ten points lie in their 90 % band on generated motion: the prior is in doubt, too
+_WIDER = 1.3  # bands, so that nine of ten points lie in their 90 % band on generated motion: the prior is in doubt, too
+_LOST = 6.0  # standard deviations by which an image is too far off, so that its camera is looked for from all sides
+_MOST_LOOKED_FOR = 1000  # frames, while learning
 _FIRST_NOISE = 1e-2  # σ
 _FREEDOM = 1e-2  # variance that C grants every coordinate at the start, beside that of the shapes to start from
 _LARGEST = 10.0  # root mean square distance of a shape's points: a network that has diverged may say anything
@@ -85,21 +90,22 @@ def learn(X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -> Prior:
 
     some = rest[:_FRAMES_OF_THE_WHOLE]
     first, M[some] = _whole(*at(some))
-    S, M = _apply_one(without_noise(first), X, weight, M)
+    S, M = _apply_whole(without_noise(first), X, weight, M)
     whole, rank = _best_rank(first, at(some), at(kept))
     if rank is not None:
-        S, M = _apply_one(whole, X, weight, M)
+        S, M = _apply_whole(whole, X, weight, M)
     best: Prior = (whole,)
     lowest = _unlikeliness(best, at(kept))
-    mixtures = [_rigid_components(at(some), whole, at(kept), lowest)]
+    rigid = _rigid_components(at(some), whole, at(kept), lowest)
+    if rigid and (value := _unlikeliness((whole, *rigid), at(kept))) < lowest:
+        best, lowest = (whole, *rigid), value
     most = len(rest) // _FRAMES_PER_COMPONENT
-    for n in (most // 9, most // 3, most):
+    for n in (most, most // 3, most // 9):  # as many as the frames can feed; fewer where that is not better
         if n > 1:
             frames = at(rest[: n * _FRAMES_PER_COMPONENT])
-            mixtures.append(_components(n, frames, whole, replace(_FREELY, rank=rank)))
-    for mixture in mixtures:
-        if mixture and (value := _unlikeliness((whole, *mixture), at(kept))) < lowest:
-            best, lowest = (whole, *mixture), value
+            mixture = _components(n, frames, whole, replace(_FREELY, rank=rank))
+            if mixture and _unlikeliness((whole, *mixture), at(kept)) < lowest:
+                return (whole, *mixture)
     return best
 
 
@@ -122,7 +128,7 @@ def choose(X: Tensor, weight: Tensor, starts: Sequence[tuple[Tensor, Tensor]]) -
         S, M = _checked(S.double()), M.double().clone()
         whole = without_noise(_whole(X[rest].double(), weight[rest], S[rest], M[rest])[0])
         frames = X[kept].double(), weight[kept]
-        values.append(_unlikeliness((whole,), (*frames, *_apply_one(whole, *frames, M[kept]))))
+        values.append(_unlikeliness((whole,), (*frames, *_apply_whole(whole, *frames, M[kept]))))
     return int(torch.tensor(values).nan_to_num(math.inf).argmin())
 
 
@@ -135,10 +141,14 @@ def apply(prior: Prior, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Tensor, T
     X, weight, M : as in `learn`; M is the camera to start from
     """
     X, M = X.double(), M.double()
-    S, M = _apply_one(prior[0], X, weight, M)
-    if len(prior) > 1:
-        component = _assign(prior[1:], X, weight, S, M)
-        S, M = _fit_each(prior[1:], component, X, weight, M, _NEWTON_STEPS)
+    component, S, M = _follow(prior, X, weight, M)
+    mixture = _mixture(prior)
+    lost = (_of_each_component(astray, mixture, component, X, weight, M) > _LOST).nonzero()[:, 0]
+    if len(lost):
+        part = X[lost], weight[lost]
+        other, other_S, other_M = _follow(prior, *part, search(prior[0], *part, M[lost]))
+        better = _unlikely(mixture, other, *part, other_M) < _unlikely(mixture, component[lost], *part, M[lost])
+        S[lost[better]], M[lost[better]] = other_S[better], other_M[better]
     return S, M
 
 
@@ -157,6 +167,7 @@ def uncertainty(prior: Prior, X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -
     X, mixture = X.double(), _mixture(prior)
     near, value = _nearest(mixture, X, weight, S, M)
     share = torch.softmax(-value, 1)
+    own = share.argmax(1)
     share = torch.where(share > _LEAST_SHARE, share, 0.0)
     share = share / share.sum(1, keepdim=True)
     seen = S @ with_depth(M)
@@ -165,9 +176,11 @@ def uncertainty(prior: Prior, X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -
         i, column = ((near == k) & (share > 0)).nonzero(as_tuple=True)
         if len(i):
             part = X[i], weight[i]
-            other_S, other_M = fit(gaussian, *part, M[i], _STEPS_OF_ANOTHER)
+            other_M, other = M[i], column != own[i]
+            other_M[other] = turn(gaussian, X[i[other]], weight[i[other]], M[i[other]], _STEPS_OF_ANOTHER)
+            other_S, each = doubt(gaussian, *part, other_M)
             apart = other_S @ with_depth(other_M) - seen[i]
-            each = doubt(gaussian, *part, other_M) + apart[..., :, None] * apart[..., None, :]
+            each = each + apart[..., :, None] * apart[..., None, :]
             result[i] += share[i, column][:, None, None, None] * each
     return _WIDER**2 * result
 
@@ -180,13 +193,25 @@ def negative_log_likelihood(prior: Prior, X: Tensor, weight: Tensor, M: Tensor) 
     X, M = X.double(), M.double()
     mixture = _mixture(prior)
     component = _assign(mixture, X, weight, fit(prior[0], X, weight, M, 0)[0], M)
-    each = _of_each_component(of_each_frame, mixture, component, X, weight, M)
+    each = _unlikely(mixture, component, X, weight, M)
     return float((each / (2 * (weight > 0).sum(1))).mean())
 
 
 def _mixture(prior):
-    """The components, or the whole where there are none."""
-    return prior[1:] or prior
+    """The components, each of them twice, or the whole where there are none.
+
+    New frames are never quite like those that a component was learned from. So each has a wider twin, which borrows
+    from the covariance of all components; the image decides between the two.
+    """
+    components = prior[1:]
+    if not components:
+        return prior
+    pooled = sum(g.share * g.covariance for g in components) / sum(g.share for g in components)
+    wider = [replace(g, covariance=torch.lerp(g.covariance, pooled, _BORROWED)) for g in components]
+    return (
+        *(replace(g, share=g.share * (1 - _SHARE_OF_THE_WIDER)) for g in components),
+        *(replace(g, share=g.share * _SHARE_OF_THE_WIDER) for g in wider),
+    )
 
 
 def _checked(S):
@@ -195,9 +220,24 @@ def _checked(S):
     return S / (S.flatten(1).norm(dim=1) / (_LARGEST * S.shape[1] ** 0.5)).clamp(min=1)[:, None, None]
 
 
-def _apply_one(gaussian, X, weight, M):
-    """Shapes and cameras under one Gaussian, in the hand that is likelier."""
-    S, M = find(gaussian, X, weight, M, _NEWTON_STEPS)
+def _follow(prior, X, weight, M):
+    """Component, shape and camera of every frame: first under the whole, in the hand that is likelier."""
+    S, M = fit(prior[0], X, weight, M, _NEWTON_STEPS)
+    S, M, _, _ = right_hand(prior[0], X, weight, S, M)
+    if len(prior) == 1:
+        return torch.zeros(len(X), dtype=torch.long), S, M
+    mixture = _mixture(prior)
+    component = _assign(mixture, X, weight, S, M)
+    return component, *_fit_each(mixture, component, X, weight, M, _NEWTON_STEPS)
+
+
+def _apply_whole(gaussian, X, weight, M):
+    """`apply` for learning. Frames of several kinds are not one Gaussian, so only the farthest are looked for."""
+    M = turn(gaussian, X, weight, M, _NEWTON_STEPS)
+    far, i = astray(gaussian, X, weight, M).topk(min(len(X), _MOST_LOOKED_FOR))
+    i = i[far > _LOST]
+    M[i] = search(gaussian, X[i], weight[i], M[i])
+    S, M = fit(gaussian, X, weight, M, 0)
     return right_hand(gaussian, X, weight, S, M)[:2]
 
 
@@ -238,14 +278,13 @@ class _Plan:
     """How the components of a mixture are learned."""
 
     rank: int | None
-    rounds: int  # of sharing out the frames anew
-    iterations: int  # of a component in each round
+    iterations: tuple[int, ...]  # of a component in each round; before a round, the frames are shared out anew
     strength: float  # frames that a component's start counts for
     least: int  # frames of a component
 
 
-_FREELY = _Plan(rank=None, rounds=2, iterations=4, strength=20, least=_FRAMES_PER_COMPONENT // 4)
-_RIGIDLY = _Plan(rank=0, rounds=3, iterations=6, strength=0.1, least=8)
+_FREELY = _Plan(rank=None, iterations=(2, 8), strength=20, least=_FRAMES_PER_COMPONENT // 4)
+_RIGIDLY = _Plan(rank=0, iterations=(6, 6, 6), strength=0.1, least=8)
 
 
 def _components(n, frames, whole, plan):
@@ -262,7 +301,7 @@ def _learn_each(component, frames, whole, plan):
     X, weight, S, M = frames
     M = M.clone()
     mixture: list[Gaussian] = []
-    for _ in range(plan.rounds):
+    for iterations in plan.iterations:
         if mixture:
             component = _assign(mixture, X, weight, S, M)
             S, M = _fit_each(mixture, component, X, weight, M, 0)
@@ -273,7 +312,7 @@ def _learn_each(component, frames, whole, plan):
                 start = _start(S[i], whole)
                 if before:  # go on, but let go of some of what was learned from other frames
                     start = replace(before[k], covariance=(start.covariance + before[k].covariance) / 2)
-                how = {"iterations": plan.iterations, "strength": plan.strength, "rank": plan.rank}
+                how = {"iterations": iterations, "strength": plan.strength, "rank": plan.rank}
                 gaussian, M[i] = maximise(start, X[i], weight[i], M[i], **how)
                 mixture.append(replace(gaussian, share=len(i) / len(X)))
     return tuple(without_noise(g, plan.rank) for g in mixture)
@@ -290,7 +329,7 @@ def _rigid_components(frames, whole, kept, lowest):
     n = min(_RIGID, len(few[0]) // _FRAMES_PER_RIGID)
     if n < 2:
         return ()
-    first = _components(n, few, whole, replace(_RIGIDLY, rounds=1))
+    first = _components(n, few, whole, replace(_RIGIDLY, iterations=_RIGIDLY.iterations[:1]))
     if not first or _unlikeliness((whole, *first), kept) > lowest + _HOPELESS:
         return ()
     mixture = _components(n, some, whole, _RIGIDLY)
@@ -304,8 +343,9 @@ def _rigid_components(frames, whole, kept, lowest):
         pair = divmod(int(apart.argmin()), len(mixture))
         i = torch.isin(_assign(mixture, *some), torch.tensor(pair)).nonzero()[:, 0]
         start = replace(_start(S[i], whole), share=sum(mixture[k].share for k in pair))
-        iterations = _RIGIDLY.rounds * _RIGIDLY.iterations
-        joined, _ = maximise(start, X[i], weight[i], M[i], iterations=iterations, strength=_RIGIDLY.strength, rank=0)
+        joined, _ = maximise(
+            start, X[i], weight[i], M[i], iterations=sum(_RIGIDLY.iterations), strength=_RIGIDLY.strength, rank=0
+        )
         fewer = (*(g for k, g in enumerate(mixture) if k not in pair), without_noise(joined, 0))
         new = _unlikeliness((whole, *fewer), kept)
         if new > value + _ALIKE:
@@ -348,15 +388,21 @@ def _unlikeliness(prior, frames):
     mixture = _mixture(prior)
     component = _assign(mixture, X, weight, S, M)
     _, M = _fit_each(mixture, component, X, weight, M, 2)
-    each = _of_each_component(negative_log_evidence, mixture, component, X, weight, M)
+    each = _unlikely(mixture, component, X, weight, M, negative_log_evidence)
     return float((each / (2 * (weight > 0).sum(1))).mean())
 
 
+def _unlikely(mixture, component, X, weight, M, function=of_each_frame):
+    """−log p(image) of each frame in its component, which is one of several."""
+    share = torch.tensor([g.share for g in mixture], dtype=X.dtype)
+    return _of_each_component(function, mixture, component, X, weight, M) - share.log()[component]
+
+
 def _of_each_component(function, mixture, component, X, weight, M):
-    """A negative logarithm of each frame in its component, which is one of several."""
+    """A function of each frame, in its component."""
     value = torch.empty(len(X), dtype=X.dtype)
     for k, gaussian in enumerate(mixture):
         i = (component == k).nonzero()[:, 0]
         if len(i):
-            value[i] = function(gaussian, X[i], weight[i], M[i]) - math.log(gaussian.share)
+            value[i] = function(gaussian, X[i], weight[i], M[i])
     return value

@@ -30,7 +30,9 @@ def test_unknown_names_are_refused_with_the_known_ones(name):
         datasets.load("motion-0")
 
 
-@pytest.mark.parametrize("name", ["cmu_bvh/martial", "cmu_bvh/05", "classic/drink.npz", "animals/monkey.npz"])
+@pytest.mark.parametrize(
+    "name", ["cmu_bvh/martial", "cmu_bvh/05", "classic/drink.npz", "animals/monkey.npz", "pascal3d/sofa.mat"]
+)
 def test_absent_data_says_what_to_do(name, monkeypatch, tmp_path):
     monkeypatch.setenv("NRSFM_DATA", str(tmp_path))
     with pytest.raises(FileNotFoundError, match=f"set NRSFM_DATA to a folder that holds {name}"):

@@ -6,9 +6,11 @@
 from .bvh import CMU_BODY, load_bvh
 from .files import load_classic, load_npz
 from .motion import ACTIONS, make_motion
-from .named import data_folder, load
+from .named import PASCAL3D, data_folder, load
+from .pascal3d import load_pascal3d
 from .views import make_views
 
 __all__ = [
-    "ACTIONS", "CMU_BODY", "data_folder", "load", "load_bvh", "load_classic", "load_npz", "make_motion", "make_views",
+    "ACTIONS", "CMU_BODY", "PASCAL3D", "data_folder", "load", "load_bvh", "load_classic", "load_npz", "load_pascal3d",
+    "make_motion", "make_views",
 ]  # fmt: skip

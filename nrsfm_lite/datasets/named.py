@@ -11,11 +11,13 @@ from ..data import Landmarks
 from .bvh import CMU_BODY, load_bvh
 from .files import load_classic, load_npz
 from .motion import make_motion
+from .pascal3d import load_pascal3d
 
 GENERATED = {"motion": 4000, "motion-small": 600}  # frames
 CMU = ("martial", "salsa", "indian", "05")
 CLASSIC = ("drink", "pickup", "yoga", "stretch", "dance")
-KNOWN = (*GENERATED, "motion-N", *CMU, *CLASSIC, "monkey")
+PASCAL3D = ("aeroplane", "bicycle", "bus", "chair", "diningtable", "sofa")
+KNOWN = (*GENERATED, "motion-N", *CMU, *CLASSIC, "monkey", *PASCAL3D)
 
 
 def load(name: str) -> Landmarks:
@@ -28,6 +30,8 @@ def load(name: str) -> Landmarks:
         - ``"martial"``, ``"salsa"``, ``"indian"``, ``"05"``: a folder of ``cmu_bvh``, motions of the CMU database as
           .bvh files, of which the 31 points of `CMU_BODY` are taken.
         - ``"drink"``, ``"pickup"``, ``"yoga"``, ``"stretch"``, ``"dance"``: ``classic/NAME.npz``, see `load_classic`.
+        - ``"aeroplane"``, ``"bicycle"``, ``"bus"``, ``"chair"``, ``"diningtable"``, ``"sofa"``: the CAD models of
+          ``pascal3d/NAME.mat``, see `load_pascal3d`.
         - ``"monkey"``: ``animals/monkey.npz``, a macaque filmed by one camera (pixels, y down) and its 3D truth.
 
     Returns
@@ -55,6 +59,8 @@ def load(name: str) -> Landmarks:
         return _loaded(_real(f"cmu_bvh/{name}"), "bvh")[:]
     if name in CLASSIC:
         return _loaded(_real(f"classic/{name}.npz"), "classic")[:]
+    if name in PASCAL3D:
+        return _loaded(_real(f"pascal3d/{name}.mat"), "pascal3d")[:]
     return _loaded(_real(f"animals/{name}.npz"), "npz")[:]
 
 
@@ -76,7 +82,7 @@ def _loaded(path: Path | None, kind: int | str) -> Landmarks:
         return make_motion(int(kind), seed=0)
     if kind == "bvh":
         return load_bvh(path, joints=CMU_BODY)
-    return load_classic(path) if kind == "classic" else load_npz(path)
+    return {"classic": load_classic, "pascal3d": load_pascal3d, "npz": load_npz}[str(kind)](path)
 
 
 def _real(name: str) -> Path:
