@@ -27,6 +27,7 @@ _TURN = 1.0  # radians, standard deviation of a camera about which its image say
 _LONGEST_STEP = 0.3  # radians per Newton step
 _DAMPING = 3e-3  # of a Newton step, as a share of the mean curvature
 _ARRIVED = 3e-3  # radians: a Newton step shorter than this is the last
+FIRST_SPREAD, _LEAST_SPREAD = 0.3, 0.01  # of log scales, if every frame has a scale of its own
 _CHUNK = 64  # frames per pass, so that their matrices stay in the cache
 _HOPEFUL_SIDES, _STEPS_FROM_A_SIDE = 6, 3  # of the 24 sides, those that are followed for some Newton steps
 _STEPS_OF_THE_OTHER_HAND = 1, 4  # Newton steps before and after those are dropped that have no chance
@@ -37,13 +38,16 @@ _NO_CHANCE = 150.0  # by which −log p of the other hand is higher
 class Gaussian:
     """Of shapes: mean (P, 3), covariance (3P, 3P) ordered by axis, and the variance σ² of image coordinates.
 
-    Of a mixture, `share` is the part of the frames that belong to it.
+    Of a mixture, `share` is the part of the frames that belong to it. `spread` is the standard deviation of the
+    logarithm of a frame's own scale; 0: there is one scale for all. A camera M is a rotation's two columns times the
+    scale of its frame.
     """
 
     mean: Tensor
     covariance: Tensor
     noise: float
     share: float = 1.0
+    spread: float = 0.0
 
 
 def _root_weight(weight):
@@ -76,7 +80,7 @@ def maximise(
     for _ in range(iterations):
         C, noise = gaussian.covariance, gaussian.noise
         offset, outer = X.new_zeros(3 * P), X.new_zeros(3 * P, 3 * P)
-        known, rest = X.new_zeros(9, P * P), X.new_zeros(())
+        known, rest, unsure = X.new_zeros(9, P * P), X.new_zeros(()), X.new_zeros(())
         for part in torch.arange(B).split(_CHUNK):
             post = _posterior(gaussian, X[part], root_weight[part], M[part])
             d = (post.shapes - gaussian.mean).mT.flatten(1)  # (b, 3P)
@@ -85,12 +89,13 @@ def maximise(
             known = known + post.pairs.flatten(0, 1).T @ _split(post.precision).flatten(0, 1)  # Σ Aᵀ Σ⁻¹ A
             rest = rest + post.noise
             # The camera is in doubt, too: what a likely turn of it does to the shape, and to what the image misses by.
-            turns = _turns(post, M[part])
-            moved = (M[part][:, None] @ turns.doubt.view(-1, 3, 2, P)).view(-1, 3 * P) @ C
+            turns = _turns(gaussian, post, M[part])
+            moved = (M[part][:, None] @ turns.doubt.unflatten(2, (2, P))).view(-1, 3 * P) @ C
             outer = outer + moved.T @ moved
             missed = turns.doubt / root_weight[part, None].clamp(min=1e-6)
             rest = rest + noise**2 * missed.square().sum()
             M[part] = _newton_step(gaussian, post, M[part], turns)
+            unsure = unsure + torch.cholesky_inverse(turns.factor)[:, -1, -1].sum()
         # What the images leave open counts too: each shape's covariance given its image is C − C Aᵀ Σ⁻¹ A C.
         offset = offset / B
         new = C + (outer - C @ _join(known, 3) @ C) / B - torch.outer(offset, offset)
@@ -98,7 +103,23 @@ def maximise(
         noise = max(float(rest / (root_weight > 0).sum()), LEAST_NOISE**2)
         new = replace(gaussian, mean=gaussian.mean + offset.view(3, P).T, covariance=(new + new.T) / 2, noise=noise)
         gaussian = limited(new, rank)
+        if gaussian.spread:
+            gaussian, M = _of_mean_scale(gaussian, M, float(unsure / B))
     return gaussian, M
+
+
+def _of_mean_scale(gaussian, M, unsure):
+    """The same where scales have the geometric mean one, or shapes would grow while scales shrink, and their spread."""
+    logs = scales(M).log()
+    size = float(logs.mean().exp())
+    spread = min(max(float(logs.var(correction=0) + unsure) ** 0.5, _LEAST_SPREAD), FIRST_SPREAD)
+    C = gaussian.covariance * size**2
+    return replace(gaussian, mean=gaussian.mean * size, covariance=C, spread=spread), M / size
+
+
+def scales(M: Tensor) -> Tensor:
+    """The scales (B,) of cameras (B, 3, 2)."""
+    return M.flatten(1).norm(dim=1) / math.sqrt(2)
 
 
 def limited(gaussian: Gaussian, rank: int | None) -> Gaussian:
@@ -177,7 +198,7 @@ def turn(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor, steps: int) -
         before = M[away]
         for i in away.split(_CHUNK):
             post = _posterior(gaussian, X[i], _root_weight(weight[i]), M[i])
-            M[i] = _newton_step(gaussian, post, M[i], _turns(post, M[i]))
+            M[i] = _newton_step(gaussian, post, M[i], _turns(gaussian, post, M[i]))
         away = away[(M[away] - before).flatten(1).norm(dim=1) > _ARRIVED]
     return M
 
@@ -185,7 +206,7 @@ def turn(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor, steps: int) -
 def search(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> Tensor:
     """Cameras from all sides: of those that some Newton steps reach, and M, the likeliest of each frame."""
     every = torch.arange(len(X))
-    sides = _sides()[:, None].expand(-1, len(X), 3, 2)
+    sides = _sides()[:, None] * scales(M)[:, None, None]
     value = torch.stack([negative_log_likelihood(gaussian, X, weight, m) for m in sides])
     hopeful = value.topk(_HOPEFUL_SIDES, 0, largest=False).indices
     tried = [M, *(turn(gaussian, X, weight, sides[k, every], _STEPS_FROM_A_SIDE) for k in hopeful)]
@@ -226,6 +247,8 @@ def _likelihood(gaussian, X, weight, M):
         logs = factor.diagonal(dim1=1, dim2=2).log() - root_weight.masked_fill(hidden, gaussian.noise**0.5).log()
         count = (~hidden).double().sum(1)
         result[part] = distance[part] / 2 + logs.sum(1) + count * math.log(2 * math.pi) / 2
+    if gaussian.spread:
+        result += (scales(M).log() / gaussian.spread).square() / 2 + math.log(gaussian.spread * math.sqrt(2 * math.pi))
     return distance, result
 
 
@@ -238,9 +261,9 @@ def negative_log_evidence(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tens
     result = negative_log_likelihood(gaussian, X, weight, M)
     for part in torch.arange(len(X)).split(_CHUNK):
         post = _posterior(gaussian, X[part], _root_weight(weight[part]), M[part])
-        curvature = _turns(post, M[part]).curvature + torch.eye(3, dtype=X.dtype) / _TURN**2
-        result[part] += torch.logdet(curvature) / 2
-    return result - 1.5 * math.log(2 * math.pi) + math.log(8 * math.pi**2)  # the volume of all rotations
+        curvature = _turns(gaussian, post, M[part]).curvature + _of_the_camera(gaussian)
+        result[part] += (torch.logdet(curvature) - len(curvature[0]) * math.log(2 * math.pi)) / 2
+    return result + math.log(8 * math.pi**2)  # the volume of all rotations
 
 
 def right_hand(
@@ -264,7 +287,7 @@ def right_hand(
     mirrored = S @ with_depth(M) * torch.tensor([1, 1, -1])  # as the camera sees it, depth with the other sign
     U, _, Vh = torch.linalg.svd(gaussian.mean.T @ mirrored)
     sign = torch.linalg.det(U @ Vh)
-    turned = (torch.cat([U[..., :2], U[..., 2:] * sign[:, None, None]], 2) @ Vh)[..., :2]
+    turned = (torch.cat([U[..., :2], U[..., 2:] * sign[:, None, None]], 2) @ Vh)[..., :2] * scales(M)[:, None, None]
     first, last = _STEPS_OF_THE_OTHER_HAND
     here = negative_log_likelihood(gaussian, X, weight, M)
     turned = turn(gaussian, X, weight, turned, first)
@@ -288,7 +311,6 @@ def doubt(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Ten
     """
     B, P, _ = X.shape
     S, result = torch.empty(B, P, 3, dtype=X.dtype), torch.empty(B, P, 3, 3, dtype=X.dtype)
-    axes = torch.eye(3, dtype=X.dtype).view(1, 3, 1, 3)
     for part in torch.arange(B).split(_CHUNK):
         post = _posterior(gaussian, X[part], _root_weight(weight[part]), M[part])
         S[part] = post.shapes
@@ -297,17 +319,17 @@ def doubt(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Ten
         seen = C[:, : 2 * P]
         within = C.view(-1, 3, P, 3, P).diagonal(dim1=2, dim2=4)  # (b, 3, 3, P)
         told = torch.einsum("brip,brjp->bijp", seen.unflatten(2, (3, P)), (post.precision @ seen).unflatten(2, (3, P)))
-        moved = (torch.linalg.cross(axes, rows[:, None]) @ post.shapes.mT[:, None]).flatten(2)  # (b, 3 axes, 3P)
+        moved = (_moves(gaussian, rows) @ post.shapes.mT[:, None]).flatten(2)  # (b, directions, 3P)
         follows = moved - moved[..., : 2 * P] @ post.precision @ seen  # the shape gives way to the turn
-        turns = _turns(post, M[part])
+        turns = _turns(gaussian, post, M[part])
         follows = torch.linalg.solve_triangular(turns.factor, follows, upper=False).unflatten(2, (3, P))
         result[part] = (within - told + torch.einsum("baip,bajp->bijp", follows, follows)).permute(0, 3, 1, 2)
     return S, result
 
 
 def with_depth(M: Tensor) -> Tensor:
-    """Cameras (B, 3, 2) with the viewing direction as a third column: rotations (B, 3, 3)."""
-    return torch.cat([M, torch.linalg.cross(M[..., 0], M[..., 1])[..., None]], 2)
+    """Cameras (B, 3, 2) with the viewing direction as a third column: rotations (B, 3, 3), times the same scale."""
+    return torch.cat([M, (torch.linalg.cross(M[..., 0], M[..., 1]) / scales(M)[:, None])[..., None]], 2)
 
 
 @dataclass(frozen=True)
@@ -364,25 +386,36 @@ def _shapes(gaussian, weighted, M):
 
 @dataclass(frozen=True)
 class _Turns:
-    """What turning the camera about each axis does to some images."""
+    """What turning the camera about each axis does to some images; n is 3, or 4 with the frame's scale."""
 
-    curvature: torch.Tensor  # (B, 3, 3): Fisher information about the camera, never negative
-    factor: torch.Tensor  # (B, 3, 3): Cholesky factor L of the curvature with its prior
-    doubt: torch.Tensor  # (B, 3, 2P): L⁻¹ J √Ω Σ⁻¹ √Ω with J how an image moves
+    curvature: torch.Tensor  # (B, n, n): Fisher information about the camera, never negative
+    factor: torch.Tensor  # (B, n, n): Cholesky factor L of the curvature with its prior
+    doubt: torch.Tensor  # (B, n, 2P): L⁻¹ J √Ω Σ⁻¹ √Ω with J how an image moves
 
 
-def _turns(post, M):
-    axes = torch.eye(3, dtype=M.dtype).view(1, 3, 1, 3)
-    moves = torch.linalg.cross(axes, M.mT[:, None])  # (B, 3 axes, 2, 3): what each rotation does to the camera
-    J = (moves @ post.shapes.mT[:, None]).flatten(2)  # (B, 3, 2P)
+def _moves(gaussian, rows):
+    """What each rotation does to the rows (B, k, 3) of a camera, and a change of its scale: (B, n, k, 3)."""
+    axes = torch.eye(3, dtype=rows.dtype).view(1, 3, 1, 3)
+    turned = torch.linalg.cross(axes, rows[:, None])
+    return torch.cat([turned, rows[:, None]], 1) if gaussian.spread else turned
+
+
+def _of_the_camera(gaussian):
+    """What is known of a camera before its image is seen: the diagonal matrix of n inverse variances."""
+    known = [1 / _TURN**2] * 3 + ([1 / gaussian.spread**2] if gaussian.spread else [])
+    return torch.tensor(known, dtype=gaussian.mean.dtype).diag()
+
+
+def _turns(gaussian, post, M):
+    J = (_moves(gaussian, M.mT) @ post.shapes.mT[:, None]).flatten(2)  # (B, n, 2P)
     weighted = J @ post.precision
     curvature = weighted @ J.mT
-    factor = torch.linalg.cholesky(curvature + torch.eye(3, dtype=M.dtype) / _TURN**2)
+    factor = torch.linalg.cholesky(curvature + _of_the_camera(gaussian))
     return _Turns(curvature, factor, torch.linalg.solve_triangular(factor, weighted, upper=False))
 
 
 def _newton_step(gaussian, post, M, turns):
-    """The cameras after one Newton step on −log p(image), by a small rotation of each."""
+    """The cameras after one Newton step on −log p(image), by a small rotation, and by its scale if it is free."""
     B, P, _ = post.shapes.shape
     a = post.weighted
     Q = _split(post.precision - a[:, :, None] * a[:, None])  # (B, 4, P²)
@@ -390,12 +423,17 @@ def _newton_step(gaussian, post, M, turns):
     g = torch.einsum("bmj,bijlm->bli", M, T) - gaussian.mean.T @ a.view(B, 2, P).mT  # by the entries of M
     gradient = torch.linalg.cross(M.mT, g.mT).sum(1)  # by a rotation about each axis
     damping = _DAMPING * turns.curvature.diagonal(dim1=1, dim2=2).mean(1) + 1e-9
-    damped = turns.curvature + damping[:, None, None] * torch.eye(3, dtype=M.dtype)
-    turn = -torch.linalg.solve(damped, gradient)
-    turn = turn * (_LONGEST_STEP / turn.norm(dim=1, keepdim=True)).clamp(max=1)
-    x, y, z = turn.unbind(1)
+    damped = turns.curvature + damping[:, None, None] * torch.eye(turns.curvature.shape[1], dtype=M.dtype)
+    if gaussian.spread:
+        by_scale = (M * g).sum((1, 2)) + scales(M).log() / gaussian.spread**2
+        gradient = torch.cat([gradient, by_scale[:, None]], 1)
+        damped[:, 3, 3] += 1 / gaussian.spread**2
+    step = -torch.linalg.solve(damped, gradient)
+    step = step * (_LONGEST_STEP / step.norm(dim=1, keepdim=True)).clamp(max=1)
+    x, y, z = step[:, :3].unbind(1)
     o = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o], 1).view(B, 3, 3)) @ M
+    M = torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o], 1).view(B, 3, 3)) @ M
+    return M * step[:, 3].exp()[:, None, None] if gaussian.spread else M
 
 
 def _trace(A):

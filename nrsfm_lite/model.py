@@ -24,7 +24,7 @@ from .shape_prior import Prior
 from .sparse_coding import mutual_coherence
 
 _FOUND = ("scale", "origin", "covariance")  # fields of a `Normalizer` that training finds
-_OF_A_GAUSSIAN = ("mean", "covariance", "noise", "share")
+_OF_A_GAUSSIAN = ("mean", "covariance", "noise", "share", "spread")
 EPSILON = 0.05  # ε of the 4×2 model: every entry of the row of translations in D₁, up to its sign
 
 
@@ -355,8 +355,10 @@ class DeepNRSfM(nn.Module):
         self.normalizer = replace(self.normalizer, scale=float(scale), origin=origin, covariance=covariance)
         n = len({key.split("/")[1] for key in state if key.startswith("prior/")})
         parts = [{key: state[f"prior/{i}/{key}"] for key in _OF_A_GAUSSIAN} for i in range(n)]
+        scalars = _OF_A_GAUSSIAN[2:]
         self.prior = (
-            tuple(Gaussian(p["mean"], p["covariance"], float(p["noise"]), float(p["share"])) for p in parts) or None
+            tuple(Gaussian(p["mean"], p["covariance"], **{key: float(p[key]) for key in scalars}) for p in parts)
+            or None
         )
 
     def to_arrays(self) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -15,11 +15,12 @@ from . import baselines, normalizer, shape_prior
 from .cameras import nearest_orthonormal
 from .checks import one_of, truth, whole
 from .data import Reconstruction
+from .gaussian import scales
 from .images import Images, read
 from .model import Config, DeepNRSfM
 from .shape_prior import Prior
 from .threads import use_threads
-from .training import SCHEDULES, check_training, learn_prior, or_warn, read_to_train, train
+from .training import SCHEDULES, check_training, free_scale, learn_prior, or_warn, read_to_train, train
 
 _CHUNK = 4096  # frames per pass: memory stays flat in the number of frames
 _FEW = 2000  # frames, up to which other starts than the network are tried
@@ -70,9 +71,10 @@ def reconstruct(
         to it from the network's guess. "code": code and camera fitted to the frame's points by gradient
         descent, dictionaries fixed. False: one forward pass of the network.
     adapt : bool
-        Learn the shape prior from these frames instead of taking the model's; it pays for new motions of
-        some hundred frames or more. Without it, each frame is reconstructed on its own. A model without
-        a prior always learns it here.
+        Learn a shape prior from these frames, starting from what the model's makes of them, and take it if it
+        predicts what it has not seen better than the model's does. It takes longer, and pays for a film of a new
+        motion, even one of some ten frames. Without it, each frame is reconstructed on its own. A model without a
+        prior always learns it here.
     confidence : (F, P), optional
         From 0 to 1: how far to trust each visible point; 0 hides it. A weight in the network's first layer and its
         loss; in the refinement, a point's noise is divided by it. Default: that of the Landmarks, else 1.
@@ -153,22 +155,32 @@ def _check_same(model: DeepNRSfM, **settings: Any) -> None:
 
 
 def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> Prior:
-    """The shape prior of these frames; of few frames from the best of several starts, for the network may be wrong."""
+    """The shape prior of these frames, or the model's own, if it has one that serves them better.
+
+    What the network makes of them is where it starts, refined by the model's prior if there is one. Of few frames
+    classical methods are tried, too: the network may be wrong.
+    """
     X, mean, weight = images.tensors(device=model.device)
     image, X, _ = model.normalizer.normalize(X, mean, weight)
-    if len(images) > _FEW:
+    prior, free = model.prior, free_scale(model)
+    if prior is None and len(images) > _FEW:
         return learn_prior(model, image, X.cpu(), weight.cpu(), torch.Generator().manual_seed(seed))
     with torch.no_grad():
         _, S, M = model.lift(image)
     X, weight, image, S, M = X.cpu(), weight.cpu(), image.double().cpu(), S.double().cpu(), M.double().cpu()
+    if prior is not None:
+        S, M = shape_prior.apply(prior, X, weight, M)
     starts = [(S, M)]
-    # In single precision: the last digits of another unit of length are gone, which can decide between two minima.
-    for other_S, other_M in baselines.starts(image.float().double().numpy(), seed):
-        # Into the network's world, so that its cameras of other frames remain a start for this prior.
-        U, _, Vh = torch.linalg.svd(torch.einsum("fij,fkj->ik", M, torch.as_tensor(other_M)))
-        starts.append((torch.as_tensor(other_S) @ (U @ Vh).mT, U @ Vh @ torch.as_tensor(other_M)))
-    S, M = starts[shape_prior.choose(X, weight, starts)]
-    return shape_prior.learn(X, weight, S, M)
+    if len(images) <= _FEW:
+        # In single precision: the last digits of another unit of length are gone, which can decide between two minima.
+        for other_S, other_M in baselines.starts(image.float().double().numpy(), seed):
+            # Into the network's world, so that its cameras of other frames remain a start for this prior.
+            U, _, Vh = torch.linalg.svd(torch.einsum("fij,fkj->ik", M, torch.as_tensor(other_M)))
+            starts.append((torch.as_tensor(other_S) @ (U @ Vh).mT, U @ Vh @ torch.as_tensor(other_M)))
+        S, M = starts[shape_prior.choose(X, weight, starts, free_scale=free)]
+    if prior is not None:
+        return shape_prior.adapt(prior, X, weight, S, M)
+    return shape_prior.learn(X, weight, S, M, free_scale=free)
 
 
 def _infer(
@@ -218,6 +230,7 @@ def infer(
     if how is not None and not isinstance(how, str):
         S, M = shape_prior.apply(how, X.cpu(), weight.cpu(), M.cpu())
         doubt = shape_prior.uncertainty(how, X.cpu(), weight.cpu(), S, M) * unit.cpu()[:, None, None, None] ** 2
+        S = S * scales(M)[:, None, None]  # 1, or the frame's own, which goes into the shape
     elif how == "code":
         psi, M = _refine_code(model, X.to(model.dtype), weight, psi, M)
         with torch.no_grad():

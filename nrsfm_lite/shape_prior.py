@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from .gaussian import (
+    FIRST_SPREAD,
     Gaussian,
     astray,
     covariance,
@@ -35,6 +36,7 @@ from .gaussian import (
     without_noise,
 )
 from .gaussian import negative_log_likelihood as of_each_frame
+from .normalizer import center, weighted_mean
 
 MOST_FRAMES = 20_000  # that `learn` takes a look at
 _KEPT_BACK, _LEAST_KEPT_BACK = 300, 20  # frames, for decisions: a tenth, at most and at least so many
@@ -42,6 +44,7 @@ _FRAMES_OF_THE_WHOLE = 2000  # more add little to one Gaussian
 _FRAMES_OF_A_TRIAL = 800
 _FRAMES_PER_COMPONENT = 250  # on average, at least
 _ROUNDS, _ITERATIONS_OF_A_ROUND = 4, 4  # of the whole; between rounds mirrored frames are repaired
+_ROUNDS_WITH_SCALES = 10  # scales are learned slowly
 _RANKS = (16, 8, 4, 2, 1, 0)  # that are tried for the whole, beside all directions, as long as there is hope
 _RIGID = 16  # components of rank zero to begin with, at most, before those that are alike are joined
 _FRAMES_PER_RIGID = 25  # on average, at least, to begin with
@@ -63,7 +66,7 @@ _Frames = tuple[Tensor, Tensor, Tensor, Tensor]  # X, weight, S and M
 Prior = tuple[Gaussian, ...]  # the whole first; then, if any, the components of the mixture
 
 
-def learn(X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -> Prior:
+def learn(X: Tensor, weight: Tensor, S: Tensor, M: Tensor, *, free_scale: bool = False) -> Prior:
     """The prior of a set of frames.
 
     Parameters
@@ -72,6 +75,8 @@ def learn(X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -> Prior:
     weight : (B, P) tensor, bool or from 0 to 1: a point of weight ω has the noise σ²/ω; 0 hides it
     S, M : (B, P, 3) and (B, 3, 2) tensors
         Shapes and cameras to start from, such as a network's.
+    free_scale : bool
+        Every frame has a scale of its own, found with its camera.
 
     Returns
     -------
@@ -79,17 +84,15 @@ def learn(X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -> Prior:
     likelier under a mixture, its components.
     """
     X, S, M = X.double(), _checked(S.double()), M.double().clone()
-    order = torch.randperm(len(X), generator=torch.Generator().manual_seed(0))[:MOST_FRAMES]
-    n = min(_KEPT_BACK, len(order) // 10)
-    if n < _LEAST_KEPT_BACK:  # too few to decide anything
-        return (without_noise(_whole(X, weight, S, M)[0]),)
-    kept, rest = order[:n], order[n:]
+    kept, rest = _kept_back(len(X))
+    if not len(kept):  # too few to decide anything
+        return (without_noise(_whole(X, weight, S, M, free_scale)[0]),)
 
     def at(i: Tensor) -> _Frames:
         return X[i], weight[i], S[i], M[i]
 
     some = rest[:_FRAMES_OF_THE_WHOLE]
-    first, M[some] = _whole(*at(some))
+    first, M[some] = _whole(*at(some), free_scale)
     S, M = _apply_whole(without_noise(first), X, weight, M)
     whole, rank = _best_rank(first, at(some), at(kept))
     if rank is not None:
@@ -109,7 +112,7 @@ def learn(X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -> Prior:
     return best
 
 
-def choose(X: Tensor, weight: Tensor, starts: Sequence[tuple[Tensor, Tensor]]) -> int:
+def choose(X: Tensor, weight: Tensor, starts: Sequence[tuple[Tensor, Tensor]], *, free_scale: bool = False) -> int:
     """Which of several starts leads to the prior under which images that it has not seen are likeliest.
 
     From each, a few iterations for one Gaussian; frames kept back judge, with their own cameras from the same start.
@@ -117,23 +120,50 @@ def choose(X: Tensor, weight: Tensor, starts: Sequence[tuple[Tensor, Tensor]]) -
 
     Parameters
     ----------
-    X, weight : as in `learn`
+    X, weight, free_scale : as in `learn`
     starts : pairs of S and M, as in `learn`
     """
-    order = torch.randperm(len(X), generator=torch.Generator().manual_seed(0))
-    n = min(_KEPT_BACK, len(X) // 10)
-    kept, rest = (order, order) if n < _LEAST_KEPT_BACK else (order[:n], order[n:][: 2 * _FRAMES_OF_A_TRIAL])
+    kept, rest = _kept_back(len(X))
+    kept, rest = kept if len(kept) else rest, rest[: 2 * _FRAMES_OF_A_TRIAL]
     values = []
     for S, M in starts:
         S, M = _checked(S.double()), M.double().clone()
-        whole = without_noise(_whole(X[rest].double(), weight[rest], S[rest], M[rest])[0])
+        whole = without_noise(_whole(X[rest].double(), weight[rest], S[rest], M[rest], free_scale)[0])
         frames = X[kept].double(), weight[kept]
         values.append(_unlikeliness((whole,), (*frames, *_apply_whole(whole, *frames, M[kept]))))
     return int(torch.tensor(values).nan_to_num(math.inf).argmin())
 
 
+def adapt(prior: Prior, X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -> Prior:
+    """The prior of new frames: their own, if it says better than the given one what it has not seen; else that one.
+
+    Their own is learned from the start that is given, such as what `apply` makes of them. What it has not seen are
+    frames kept back; below 200 frames, one or two points of each frame, hidden while it is learned.
+
+    Parameters
+    ----------
+    prior : what `learn` returned for other frames
+    X, weight, S, M : as in `learn`
+    """
+    X, M = X.double(), M.double()
+    kept, _ = _kept_back(len(X))
+    free = prior[0].spread > 0
+    if len(kept):
+        own = learn(X, weight, S, M, free_scale=free)
+        frames = X[kept], weight[kept]
+        here, there = (_unlikeliness(p, (*frames, *apply(p, *frames, M[kept]))) for p in (own, prior))
+        return own if here < there else prior
+    hidden = _points_kept_back(weight)
+    left = torch.where(hidden, 0, weight)
+    part = center(X, left)[0], left
+    here, there = (_missed(X, hidden, left, *apply(p, *part, M)) for p in (learn(*part, S, M, free_scale=free), prior))
+    return learn(X, weight, S, M, free_scale=free) if here < there else prior
+
+
 def apply(prior: Prior, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Tensor, Tensor]:
     """Most probable shapes (B, P, 3) and cameras (B, 3, 2) of frames, in double precision; each frame on its own.
+
+    If every frame has a scale of its own, its camera's columns have that length.
 
     Parameters
     ----------
@@ -241,13 +271,39 @@ def _apply_whole(gaussian, X, weight, M):
     return right_hand(gaussian, X, weight, S, M)[:2]
 
 
-def _whole(X, weight, S, M):
+def _kept_back(n):
+    """Which of n frames are kept back, for decisions, and which are learned from. Of few frames, none are kept."""
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(0))[:MOST_FRAMES]
+    count = min(_KEPT_BACK, len(order) // 10)
+    count = count if count >= _LEAST_KEPT_BACK else 0
+    return order[:count], order[count:]
+
+
+def _points_kept_back(weight):
+    """(B, P) bool: two visible points of each frame, or one or none where few are visible."""
+    visible = weight > 0
+    rank = torch.rand(weight.shape, generator=torch.Generator().manual_seed(0)).masked_fill(~visible, 2.0).argsort(1)
+    count = visible.sum(1, keepdim=True)
+    return rank.argsort(1) < (count >= 5).long() + (count >= 8).long()
+
+
+def _missed(X, hidden, left, S, M):
+    """By how much hidden points of the images are missed, if translations fit those that are left; mean over points."""
+    rest = X - S @ M
+    return float((rest - weighted_mean(rest, left)[:, None])[hidden].norm(dim=1).mean())
+
+
+def _whole(X, weight, S, M, free_scale):
     """One Gaussian, its noise still in C, and the cameras; mirrored frames repaired between rounds."""
+    if free_scale:  # the sizes of shapes are those of their frames
+        size = S.flatten(1).norm(dim=1)
+        size = size / size.log().mean().exp()
+        S, M = S / size[:, None, None], M * size[:, None, None]
     P = X.shape[1]
     centred = torch.eye(P, dtype=X.dtype) - 1 / P  # C gives the centroid no variance: that is t's part
     start = covariance(S) + _FREEDOM * torch.eye(3, dtype=X.dtype).kron(centred)
-    gaussian = Gaussian(S.mean(0), start, _FIRST_NOISE**2)
-    for _ in range(_ROUNDS):
+    gaussian = Gaussian(S.mean(0), start, _FIRST_NOISE**2, spread=FIRST_SPREAD if free_scale else 0.0)
+    for _ in range(_ROUNDS_WITH_SCALES if free_scale else _ROUNDS):
         gaussian, M = maximise(gaussian, X, weight, M, iterations=_ITERATIONS_OF_A_ROUND, strength=1)
         S, M = fit(gaussian, X, weight, M, 0)
         _, M, _, _ = right_hand(gaussian, X, weight, S, M)
@@ -320,7 +376,7 @@ def _learn_each(component, frames, whole, plan):
 
 def _start(S, whole):
     """A component to begin with."""
-    return Gaussian(S.mean(0), covariance(S) + whole.covariance / 10, whole.noise)
+    return replace(whole, mean=S.mean(0), covariance=covariance(S) + whole.covariance / 10)
 
 
 def _rigid_components(frames, whole, kept, lowest):

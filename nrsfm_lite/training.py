@@ -305,7 +305,12 @@ def learn_prior(
     """
     pick = torch.randperm(len(X), generator=random)[: shape_prior.MOST_FRAMES]
     _, S, M = net.lift(image[pick].to(net.device))
-    return shape_prior.learn(X[pick], weight[pick], S.cpu(), M.cpu())
+    return shape_prior.learn(X[pick], weight[pick], S.cpu(), M.cpu(), free_scale=free_scale(net))
+
+
+def free_scale(net: DeepNRSfM) -> bool:
+    """Whether the shape prior finds a scale for every frame: images of weak perspective come in units of their own."""
+    return net.config.projection == "weak_perspective"
 
 
 class Descent:

@@ -1,5 +1,7 @@
 """One Gaussian over shapes: its likelihood, its cameras, and what images say about it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -128,3 +130,34 @@ def test_frames_of_the_other_hand_are_found_and_repaired(rigid):
     assert flipped[wrong].double().mean() > 0.9
     after = gaussian.negative_log_likelihood(prior, X, weight, repaired)
     assert (after <= before + 1e-9).all()
+
+
+def test_newton_steps_end_at_the_most_likely_scale_too():
+    prior = replace(some_prior(), spread=0.2)
+    random = torch.Generator().manual_seed(1)
+    drawn = torch.linalg.cholesky(prior.covariance) @ torch.randn(3 * P, generator=random).double()
+    S = prior.mean + drawn.view(3, P).T
+    M = 1.3 * torch.as_tensor(nl.cameras.random_cameras(1))
+    X, weight = S[None] @ M, torch.ones(1, P)
+    X = X - X.mean(1, keepdim=True)
+    for _ in range(80):
+        M = gaussian.turn(prior, X, weight, M, 1)
+    scale = gaussian.scales(M)
+    np.testing.assert_allclose(M.mT @ M, np.eye(2)[None] * float(scale) ** 2, atol=1e-9)
+
+    def unlikely(factor):
+        _, C, w, expected = by_hand(prior, X[0], np.ones(P), M[0] * factor)
+        log_scale = np.log(float(scale) * factor)
+        return -multivariate_normal(expected, C).logpdf(w) + log_scale**2 / (2 * 0.2**2)
+
+    values = [unlikely(np.exp(step)) for step in (-2e-2, 0.0, 2e-2)]
+    assert values[1] < min(values[0], values[2])
+    here, more = (gaussian.negative_log_likelihood(prior, X, weight, M * f) for f in (1, 1.1))
+    assert float(more - here) == pytest.approx(unlikely(1.1) - unlikely(1), abs=1e-6)
+
+
+def test_a_camera_with_its_depth_is_a_rotation_times_its_scale():
+    M = torch.as_tensor(nl.cameras.random_cameras(4)) * torch.tensor([0.5, 1, 2, 3])[:, None, None].double()
+    R = gaussian.with_depth(M) / gaussian.scales(M)[:, None, None]
+    torch.testing.assert_close(R @ R.mT, torch.eye(3).double().expand(4, 3, 3), rtol=0, atol=1e-12)
+    assert (torch.linalg.det(R) > 0).all()

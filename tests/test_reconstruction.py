@@ -71,6 +71,10 @@ def test_the_prior_can_be_learned_from_the_new_frames(rec):
         again = nl.reconstruct(other, model=rec.model, adapt=adapt)
         errors[adapt] = nl.metrics.normalized_error(again.shapes, other.points3d).mean()
     assert errors[True] < errors[False]
+    film = other[:20]
+    alone, adapted = (nl.reconstruct(film, model=rec.model, adapt=a).shapes for a in (False, True))
+    errors = [nl.metrics.normalized_error(S, film.points3d).mean() for S in (alone, adapted)]
+    assert errors[1] < 0.6 * errors[0]
     bare = nl.DeepNRSfM(n_points=31, generator=torch.Generator().manual_seed(0)).eval()
     assert bare.prior is None and np.isfinite(nl.reconstruct(other, model=bare).shapes).all()
 

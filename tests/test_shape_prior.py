@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import nrsfm_lite as nl
-from nrsfm_lite import normalizer, shape_prior
+from nrsfm_lite import gaussian, normalizer, shape_prior
 
 P = 6
 
@@ -133,3 +133,48 @@ def test_mirrored_frames_are_repaired_before_components_are_made(truth):
     assert nl.metrics.handedness(rough, shapes).mirrored > 0.15
     assert nl.metrics.handedness(S, shapes).mirrored < 0.02
     assert nl.metrics.rotation_only_error(S, shapes).mean() < 1.1 * error(S, shapes)
+
+
+@pytest.mark.parametrize("n", [30, 300])
+def test_new_frames_get_a_prior_of_their_own_where_that_says_more(truth, n):
+    shapes, cameras, images = truth
+    visible = torch.ones(len(images), P, dtype=torch.bool)
+    prior = shape_prior.learn(images, visible, shapes, cameras)
+    i = slice(0, n)
+    S, M = shape_prior.apply(prior, images[i], visible[i], cameras[i])
+    if n == 30:
+        assert shape_prior.adapt(prior, images[i], visible[i], S, M) is prior
+    mean = shapes.mean(0)  # another body, which moves in another way
+    other = mean + 0.3 * (mean[:, [1, 2, 0]] + (shapes[i] - mean)[:, :, [2, 0, 1]])
+    X = other @ cameras[i]
+    S, M = shape_prior.apply(prior, X, visible[i], cameras[i])
+    own = shape_prior.adapt(prior, X, visible[i], S, M)
+    assert own is not prior
+    assert error(shape_prior.apply(own, X, visible[i], M)[0], other) < 0.5 * error(S, other)
+
+
+def test_nothing_is_kept_back_of_points_that_are_needed():
+    weight = torch.ones(3, 9)
+    weight[0, 5:] = 0  # five, seven and nine points are visible
+    weight[1, 7:] = 0
+    hidden = shape_prior._points_kept_back(weight)
+    assert hidden.sum(1).tolist() == [1, 1, 2] and not hidden[weight == 0].any()
+    weight[0, 4] = 0
+    assert shape_prior._points_kept_back(weight).sum(1).tolist() == [0, 1, 2]
+
+
+def test_the_scale_of_every_frame_is_found(truth):
+    shapes, cameras, images = truth
+    true = torch.as_tensor(np.random.default_rng(6).normal(0, 0.15, len(images))).exp()
+    X, visible = images * true[:, None, None], torch.ones(len(images), P, dtype=torch.bool)
+    rough = turned_by(cameras, 0.1 * np.random.default_rng(4).normal(size=(len(X), 3)))
+    start = shapes.mean(0).expand_as(shapes)
+    found = {}
+    for free in (False, True):
+        prior = shape_prior.learn(X, visible, start, rough, free_scale=free)
+        S, M = shape_prior.apply(prior, X, visible, rough)
+        found[free] = S * gaussian.scales(M)[:, None, None], gaussian.scales(M)
+    assert (found[False][1] - 1).abs().max() < 1e-9
+    assert np.corrcoef(found[True][1].log(), true.log())[0, 1] > 0.9
+    errors = [error(found[free][0], shapes * true[:, None, None]) for free in (True, False)]
+    assert errors[0] < 0.8 * errors[1]

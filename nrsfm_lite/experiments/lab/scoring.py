@@ -7,8 +7,9 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
 
-from ... import datasets, metrics, quality
+from ... import cameras, datasets, metrics, quality
 from ...data import Landmarks, Reconstruction
 from ...model import Config, DeepNRSfM
 from ...reconstruction import reconstruct
@@ -66,9 +67,9 @@ def default_schedule(rates: float = 1.0, **changes: Any) -> Schedule:
     return replace(plan, rate=rates * plan.rate, muon_rate=rates * plan.muon_rate, **changes)
 
 
-def views(data: str, **how: Any) -> tuple[Landmarks, Landmarks]:
+def views(data: str, seed: int = 0, **how: Any) -> tuple[Landmarks, Landmarks]:
     """Training frames (the first 80 % of the sequences) and unseen ones, each under its own random camera."""
-    return datasets.make_views(datasets.load(data), seed=0, **how).split()
+    return datasets.make_views(datasets.load(data), seed=seed, **how).split()
 
 
 def train_and_score(data: str, seed: int, how: dict[str, Any], **config: Any) -> tuple[DeepNRSfM, dict[str, Any]]:
@@ -115,6 +116,21 @@ def errors(key: str, rec: Reconstruction, frames: Landmarks) -> dict[str, object
         f"{key}_turned": float(metrics.rotation_only_error(rec.shapes, frames.points3d).mean()),
         f"{key}_mirrored": metrics.handedness(rec.shapes, frames.points3d).mirrored,
     }
+
+
+def coverage(rec: Reconstruction, frames: Landmarks, share: float = 0.9) -> tuple[float, float]:
+    """Share of the points whose depth lies in its band of this probability, and the bands' median width.
+
+    Seen by each frame's camera, so that nothing is aligned but the sign of all depths: a mirrored frame counts as
+    missed. The width is that of the whole band, over the root mean square distance of the true points from their
+    centroid.
+    """
+    truth = frames.points3d - frames.points3d.mean(1, keepdims=True)
+    found, true = (cameras.camera_frame(*c)[..., 2] for c in ((rec.shapes, rec.cameras), (truth, frames.cameras)))
+    half = norm.ppf((1 + share) / 2) * np.sqrt(rec.uncertainty[..., 2, 2])
+    off = np.abs(np.sign((found * true).sum()) * found - true)
+    size = np.sqrt(np.square(truth).sum(2).mean())
+    return float((off < half).mean()), float(np.median(2 * half) / size)
 
 
 def variants(setting: str, values: Sequence[str], seeds: int, quick: bool) -> list[dict[str, object]]:
