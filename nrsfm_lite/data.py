@@ -195,7 +195,7 @@ class Reconstruction:
         depth (the cross product of the camera's columns); in squared units of the input (chapter 10). That the whole
         shape may be mirrored in depth is not in it. None for methods that do not say.
     coherence : float or None
-        Mutual coherence of the last dictionary (chapter 10); None for methods without one.
+        Mutual coherence of the last dictionary (chapter 10a); None for methods without one.
     method : str
     converged : bool
         False if an iterative method was stopped by a limit before it was done. A network is trained

@@ -182,7 +182,7 @@ class DeepNRSfM(nn.Module):
 
     @property
     def coherence(self) -> float:
-        """Mutual coherence of the last dictionary, a quality measure that needs no truth (chapter 10)."""
+        """Mutual coherence of the last dictionary, a quality measure that needs no truth (chapter 10a)."""
         D = self.D[-1]
         return mutual_coherence(D if D.ndim == 2 else D.flatten(1).T)
 

@@ -1,4 +1,4 @@
-"""How good a trained network is, judged without any 3D (chapter 10).
+"""How good a trained network is, judged without any 3D (chapter 10a).
 
 Every score looks at a network and at images, never at a true shape. Lower is better for all but
 `code_dimension`, where neither direction is better by itself. `coherence` of the last dictionary, the

@@ -233,7 +233,7 @@ def test_steps_are_not_cut_and_the_device_must_be_there(views):
 
 
 def test_a_prior_that_cannot_be_learned_does_not_cost_the_training(views, monkeypatch):
-    def fails(*arguments):
+    def fails(*arguments, **settings):
         raise torch.linalg.LinAlgError("not positive definite")
 
     monkeypatch.setattr(training.shape_prior, "learn", fails)

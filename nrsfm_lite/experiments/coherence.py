@@ -1,4 +1,4 @@
-"""Which number, taken without ground truth, tells a good network from a bad one (chapter 10)?"""
+"""Which number, taken without ground truth, tells a good network from a bad one (chapter 10a)?"""
 
 import numpy as np
 from scipy.stats import spearmanr

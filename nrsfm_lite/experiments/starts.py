@@ -45,7 +45,8 @@ def conditions(quick: bool) -> dict[str, object]:
         "seed": "of the cameras, of the training, and of whatever else a start draws",
         "after": "em_gaussian from that start, its defaults: the same prior for all",
         "bicycle, chair": f"{_VIEWS_OF_MODELS} views of the CAD models of PASCAL3D+",
-        "errors": "mean normalised 3D error; _turned: with rotations only, after one mirror image for all frames; "
+        "errors": "before: of the start; after: of what the prior makes of it; mean normalised 3D error; "
+        "_turned: with rotations only, after one mirror image for all frames; "
         "_mirrored: share of the frames of the other hand",
         "seconds": "start_seconds: of the start, a training included; after_seconds: of the prior; one thread",
         "steps": scoring.QUICK_STEPS if quick else "the schedule's",
@@ -60,12 +61,12 @@ def measure(data: str, views: str, start: str, seed: int) -> dict[str, object]:
     between = time.perf_counter()
     rec = baselines.em_gaussian(frames, start=first, progress=False)
     seconds: dict[str, object] = {"start_seconds": between - begun, "after_seconds": time.perf_counter() - between}
-    return scoring.errors("start", first, frames) | scoring.errors("after", rec, frames) | seconds
+    return scoring.errors("before", first, frames) | scoring.errors("after", rec, frames) | seconds
 
 
 def report(rows: list[dict[str, str]]) -> str:
     """Mean and spread over seeds, a line per data set, views and start."""
-    columns = ("start", "start_mirrored", "after", "after_turned", "after_mirrored", "after_seconds")
+    columns = ("before", "before_mirrored", "after", "after_turned", "after_mirrored", "after_seconds")
     return scoring.by_groups(("data", "views", "start"), columns, rows)
 
 

@@ -87,6 +87,8 @@ def run(
         measured = experiment.measure(**case)
         seconds = {"seconds": _text(time.perf_counter() - begun)}
         several = measured if isinstance(measured, list) else [measured]
+        if taken := {k for m in several for k in m} & key.keys():
+            raise ValueError(f"{name}: measured {', '.join(sorted(taken))}, which is what names the case.")
         added = [{**key, **{k: _text(v) for k, v in m.items()}, **seconds} for m in several]
         rows += added
         rows.sort(key=lambda r: _place(r, cases))
