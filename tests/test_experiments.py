@@ -84,6 +84,12 @@ def test_a_case_may_give_several_rows(toy, tmp_path):
     assert len(runner.run("speed", folder=tmp_path, say=lambda line: None)) == 12  # nothing is measured again
 
 
+def test_what_names_a_case_is_not_overwritten(toy, tmp_path):
+    toy.measure = lambda data, seed: {"square": seed**2, "seed": 0.5}
+    with pytest.raises(ValueError, match="measured seed, which is what names the case"):
+        runner.run("speed", folder=tmp_path, say=lambda line: None)
+
+
 @pytest.mark.parametrize("name", experiments.NAMES)
 def test_the_quick_form_of_every_experiment_runs(name, tmp_path, capsys):
     assert cli.main(["experiment", name, "--quick", "--out", str(tmp_path)]) == 0
