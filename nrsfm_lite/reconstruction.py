@@ -64,8 +64,8 @@ def reconstruct(
         Train a 4×2 model, which takes the images as they are, uncentred, and finds their translation (chapter
         13). Default: False, or what the given model is.
     projection : "orthographic" or "weak_perspective", optional
-        One scale for all frames, or one per frame that goes into the shape. Default: orthographic, or what the
-        given model is.
+        One scale for all frames, or one per frame that goes into the shape; the refinement finds it with the
+        camera. Default: orthographic, or what the given model is.
     refine : True, "code" or False
         True: the most probable shape of each frame under the model's shape prior, with the camera fitted
         to it from the network's guess. "code": code and camera fitted to the frame's points by gradient
@@ -83,7 +83,8 @@ def reconstruct(
 
     Returns
     -------
-    Reconstruction in the units of W.
+    Reconstruction in the units of W. Its `uncertainty` says how far each point may be off. No image decides between all
+    shapes and their mirror images; nor, in a collection, whether two of its members are of one hand.
 
     Raises
     ------
