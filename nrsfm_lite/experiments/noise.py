@@ -7,13 +7,14 @@ from .lab import scoring
 
 QUESTION = "How does the error grow with the noise of the images, and what do the thresholds do about it?"
 _LEVELS = (0.0, 0.05, 0.1, 0.2, 0.3)
+_CLASSICAL = {"rigid": baselines.tomasi_kanade, "pta": baselines.pta, "em_gaussian": baselines.em_gaussian}
 
 
 def cases(quick: bool) -> list[dict[str, object]]:
     """Data, noise, method and seed."""
     data, levels, seeds = ("motion-small", (0.2,), 1) if quick else ("martial", _LEVELS, 3)
     rows = [(n, "network", s) for s in range(seeds) for n in levels]
-    rows += [(n, m, 0) for m in ("rigid", "pta") for n in levels]
+    rows += [(n, m, 0) for m in _CLASSICAL for n in levels]
     return [{"data": data, "noise": n, "method": m, "seed": s} for n, m, s in rows]
 
 
@@ -24,6 +25,7 @@ def conditions(quick: bool) -> dict[str, object]:
         "errors": "normalised 3D error against the noiseless shapes",
         "first_threshold": "mean of the first encoder threshold; active: share of positive entries of the first code",
         "pta": "rank 12, on frames in their order, each from its own camera, for which it is not made",
+        "em_gaussian": "the shape prior from one rigid shape, no network",
         "steps": scoring.QUICK_STEPS if quick else "the default schedule's",
     }
 
@@ -34,8 +36,7 @@ def measure(data: str, noise: float, method: str, seed: int) -> dict[str, object
         net, result = scoring.train_and_score(data, seed, {"noise": noise})
         return {k: v for k, v in result.items() if not k.endswith("_hidden")} | _sparsity(net, data, noise)
     train, _ = scoring.views(data, noise=noise)
-    baseline = baselines.tomasi_kanade if method == "rigid" else baselines.pta
-    rec = baseline(train, progress=False)
+    rec = _CLASSICAL[method](train, progress=False)
     keys = ("seen", "unseen", "refined", "shift", "refined_unseen", "first_threshold", "active", "found_noise")
     seen = scoring.hidden_errors("seen", rec.shapes, train)["seen"]
     return dict.fromkeys(keys, "") | {"seen": seen}
