@@ -398,11 +398,13 @@ def _rigid_components(frames, whole, kept, lowest):
         apart = torch.cdist(means, means).fill_diagonal_(torch.inf)
         pair = divmod(int(apart.argmin()), len(mixture))
         i = torch.isin(_assign(mixture, *some), torch.tensor(pair)).nonzero()[:, 0]
-        start = replace(_start(S[i], whole), share=sum(mixture[k].share for k in pair))
-        joined, _ = maximise(
-            start, X[i], weight[i], M[i], iterations=sum(_RIGIDLY.iterations), strength=_RIGIDLY.strength, rank=0
-        )
-        fewer = (*(g for k, g in enumerate(mixture) if k not in pair), without_noise(joined, 0))
+        fewer = tuple(g for k, g in enumerate(mixture) if k not in pair)
+        if len(i):  # else no frame is of either, any more
+            start = replace(_start(S[i], whole), share=sum(mixture[k].share for k in pair))
+            joined, _ = maximise(
+                start, X[i], weight[i], M[i], iterations=sum(_RIGIDLY.iterations), strength=_RIGIDLY.strength, rank=0
+            )
+            fewer = (*fewer, without_noise(joined, 0))
         new = _unlikeliness((whole, *fewer), kept)
         if new > value + _ALIKE:
             break
