@@ -95,7 +95,8 @@ def maximise(
             missed = turns.doubt / root_weight[part, None].clamp(min=1e-6)
             rest = rest + noise**2 * missed.square().sum()
             M[part] = _newton_step(gaussian, post, M[part], turns)
-            unsure = unsure + torch.cholesky_inverse(turns.factor)[:, -1, -1].sum()
+            if gaussian.spread:
+                unsure = unsure + torch.cholesky_inverse(turns.factor)[:, -1, -1].sum()
         # What the images leave open counts too: each shape's covariance given its image is C − C Aᵀ Σ⁻¹ A C.
         offset = offset / B
         new = C + (outer - C @ _join(known, 3) @ C) / B - torch.outer(offset, offset)

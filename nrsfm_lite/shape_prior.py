@@ -171,12 +171,12 @@ def apply(prior: Prior, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Tensor, T
     X, weight, M : as in `learn`; M is the camera to start from
     """
     X, M = X.double(), M.double()
-    component, S, M = _follow(prior, X, weight, M)
     mixture = _mixture(prior)
+    component, S, M = _follow(prior, mixture, X, weight, M)
     lost = (_of_each_component(astray, mixture, component, X, weight, M) > _LOST).nonzero()[:, 0]
     if len(lost):
         part = X[lost], weight[lost]
-        other, other_S, other_M = _follow(prior, *part, search(prior[0], *part, M[lost]))
+        other, other_S, other_M = _follow(prior, mixture, *part, search(prior[0], *part, M[lost]))
         better = _unlikely(mixture, other, *part, other_M) < _unlikely(mixture, component[lost], *part, M[lost])
         S[lost[better]], M[lost[better]] = other_S[better], other_M[better]
     return S, M
@@ -250,13 +250,12 @@ def _checked(S):
     return S / (S.flatten(1).norm(dim=1) / (_LARGEST * S.shape[1] ** 0.5)).clamp(min=1)[:, None, None]
 
 
-def _follow(prior, X, weight, M):
+def _follow(prior, mixture, X, weight, M):
     """Component, shape and camera of every frame: first under the whole, in the hand that is likelier."""
     S, M = fit(prior[0], X, weight, M, _NEWTON_STEPS)
     S, M, _, _ = right_hand(prior[0], X, weight, S, M)
     if len(prior) == 1:
         return torch.zeros(len(X), dtype=torch.long), S, M
-    mixture = _mixture(prior)
     component = _assign(mixture, X, weight, S, M)
     return component, *_fit_each(mixture, component, X, weight, M, _NEWTON_STEPS)
 

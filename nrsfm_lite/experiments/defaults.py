@@ -28,8 +28,7 @@ def conditions(quick: bool) -> dict[str, object]:
         "frames": "learned from: the first 80 % of the sequences; unseen: the others",
         "unseen": "alone: each frame on its own, under the prior that was learned from the others; adapted: with "
         "adapt=True, all unseen frames at once",
-        "errors": "mean normalised 3D error; _turned: with rotations only, after one mirror image for all frames; "
-        "_mirrored: share of the frames of the other hand",
+        "errors": scoring.ERRORS,
         "coverage": "share of points whose depth lies in its 90 % band, the sign of all depths free; width: the median "
         "of the whole band, over the root mean square distance of a shape's points from their centroid",
         "seconds": "fit_seconds: of the training, its prior included; refine_seconds: of the refinement; one thread",

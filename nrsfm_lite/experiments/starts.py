@@ -45,9 +45,7 @@ def conditions(quick: bool) -> dict[str, object]:
         "seed": "of the cameras, of the training, and of whatever else a start draws",
         "after": "em_gaussian from that start, its defaults: the same prior for all",
         "bicycle, chair": f"{_VIEWS_OF_MODELS} views of the CAD models of PASCAL3D+",
-        "errors": "before: of the start; after: of what the prior makes of it; mean normalised 3D error; "
-        "_turned: with rotations only, after one mirror image for all frames; "
-        "_mirrored: share of the frames of the other hand",
+        "errors": f"before: of the start; after: of what the prior makes of it; {scoring.ERRORS}",
         "seconds": "start_seconds: of the start, a training included; after_seconds: of the prior; one thread",
         "steps": scoring.QUICK_STEPS if quick else "the schedule's",
     }

@@ -109,6 +109,12 @@ def hidden_errors(key: str, S: np.ndarray, frames: Landmarks) -> dict[str, Any]:
     return {key: whole, f"{key}_hidden": float(np.nanmean(hidden))}
 
 
+ERRORS = (  # what the columns of `errors` are, for an experiment's conditions
+    "mean normalised 3D error; _turned: with rotations only, after one mirror image for all frames; "
+    "_mirrored: share of the frames of the other hand"
+)
+
+
 def errors(key: str, rec: Reconstruction, frames: Landmarks) -> dict[str, object]:
     """Mean normalised error under `key`, with rotations only under `key`_turned, and the share of mirrored frames."""
     return {
