@@ -161,3 +161,25 @@ def test_a_camera_with_its_depth_is_a_rotation_times_its_scale():
     R = gaussian.with_depth(M) / gaussian.scales(M)[:, None, None]
     torch.testing.assert_close(R @ R.mT, torch.eye(3).double().expand(4, 3, 3), rtol=0, atol=1e-12)
     assert (torch.linalg.det(R) > 0).all()
+
+
+@pytest.mark.parametrize("size", [0.5, 1, 2])
+def test_doubt_follows_the_size_of_a_frames_own_covariance(size):
+    """Bands of nine in ten hold as many depths where shapes vary half or twice as much as the Gaussian says."""
+    random = torch.Generator().manual_seed(0)
+    n, F = 20, 300
+    B = torch.randn(3 * n, 8, dtype=torch.double, generator=random) / 5
+    mean = torch.randn(n, 3, dtype=torch.double, generator=random)
+    prior = gaussian.Gaussian(mean - mean.mean(0), B @ B.T + 1e-2 * torch.eye(3 * n, dtype=torch.double), 1e-4)
+    drawn = torch.linalg.cholesky(prior.covariance) @ torch.randn(3 * n, F, dtype=torch.double, generator=random)
+    S = prior.mean + size * drawn.T.unflatten(1, (3, n)).mT
+    true = torch.as_tensor(nl.cameras.random_cameras(F))
+    X = S @ true
+    X = X - X.mean(1, keepdim=True)
+    weight = torch.ones(F, n, dtype=torch.bool)
+    M = gaussian.turn(prior, X, weight, true, 12)
+    found, covariances = gaussian.doubt(prior, X, weight, M)
+    off = (found @ gaussian.with_depth(M) - S @ gaussian.with_depth(true))[..., 2]
+    off = off - off.mean(1, keepdim=True)
+    inside = (off.abs() < 1.645 * covariances[..., 2, 2].sqrt()).double().mean()
+    assert 0.8 < inside < 0.98
