@@ -32,6 +32,7 @@ _CHUNK = 64  # frames per pass, so that their matrices stay in the cache
 _HOPEFUL_SIDES, _STEPS_FROM_A_SIDE = 6, 3  # of the 24 sides, those that are followed for some Newton steps
 _STEPS_OF_THE_OTHER_HAND = 1, 4  # Newton steps before and after those are dropped that have no chance
 _FREEDOM = 10.0  # degrees of, of the size of a frame's own covariance: so many coordinates as it is expected to be
+_NARROWEST = 0.75  # times a covariance: images that were learned from are nearer than they should be
 _NO_CHANCE = 150.0  # by which −log p of the other hand is higher
 
 
@@ -312,7 +313,8 @@ def doubt(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Ten
     how the shape, as the camera sees it, follows a turn of the camera, and H the Fisher information about the turn.
 
     All of it times how far the image is from the mean, squared, over how far it should be. So it is where every frame
-    has a covariance of its own size, C times a factor with an inverse gamma prior, which makes shapes Student's t.
+    has a covariance of its own size, C times a factor with an inverse gamma prior, which makes shapes Student's t; but
+    hardly narrower than C says.
     """
     B, P, _ = X.shape
     S, result = torch.empty(B, P, 3, dtype=X.dtype), torch.empty(B, P, 3, 3, dtype=X.dtype)
@@ -330,7 +332,7 @@ def doubt(gaussian: Gaussian, X: Tensor, weight: Tensor, M: Tensor) -> tuple[Ten
         follows = torch.linalg.solve_triangular(turns.factor, follows, upper=False).unflatten(2, (3, P))
         each = within - told + torch.einsum("baip,bajp->bijp", follows, follows)
         distance = (post.weighted * (X[part] - gaussian.mean @ M[part]).mT.flatten(1)).sum(1)
-        factor = (_FREEDOM + distance) / (_FREEDOM + 2 * (weight[part] > 0).sum(1))
+        factor = ((_FREEDOM + distance) / (_FREEDOM + 2 * (weight[part] > 0).sum(1))).clamp(min=_NARROWEST)
         result[part] = (factor[:, None, None, None] * each).permute(0, 3, 1, 2)
     return S, result
 
