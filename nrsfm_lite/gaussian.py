@@ -31,9 +31,9 @@ FIRST_SPREAD, _LEAST_SPREAD = 0.3, 0.01  # of log scales, if every frame has a s
 _CHUNK = 64  # frames per pass, so that their matrices stay in the cache
 _HOPEFUL_SIDES, _STEPS_FROM_A_SIDE = 6, 3  # of the 24 sides, those that are followed for some Newton steps
 _STEPS_OF_THE_OTHER_HAND = 1, 4  # Newton steps before and after those are dropped that have no chance
-_FREEDOM = 10.0  # degrees of, of the size of a frame's own covariance: so many coordinates as it is expected to be
-_NARROWEST = 0.75  # times a covariance: images that were learned from are nearer than they should be
 _NO_CHANCE = 150.0  # by which −log p of the other hand is higher
+_FREEDOM = 10.0  # of Student's t: as many coordinates speak for a frame's covariance being of the usual size
+_NARROWEST = 0.75  # times a covariance: images that were learned from are nearer than they should be
 
 
 @dataclass(frozen=True)
