@@ -76,6 +76,7 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--steps", type=int, help="training steps")
     make.add_argument("--seed", type=int, default=0, help="decides the training's start and order, and the cameras")
     make.add_argument("--checkpoint", type=Path, help="keep the state here, and go on from it if it exists")
+    make.add_argument("--occlusion", action="store_true", help="hidden points lie behind: decides the mirror image")
     make.add_argument("--uncertainty", action="store_true", help=_BANDS)
     make.add_argument("--quiet", action="store_true", help="no progress bar")
     make.set_defaults(run=_reconstruct)
@@ -112,8 +113,9 @@ def _reconstruct(arguments: argparse.Namespace) -> None:
     else:
         print(f"{len(data)} frames of {data.n_points} points")
     rec = reconstruct(
-        data, seed=arguments.seed, steps=arguments.steps, checkpoint=arguments.checkpoint, progress=not arguments.quiet
-    )
+        data, seed=arguments.seed, steps=arguments.steps, checkpoint=arguments.checkpoint,
+        occlusion=arguments.occlusion, progress=not arguments.quiet,
+    )  # fmt: skip
     if data.points3d is not None:
         error = metrics.normalized_error(rec.shapes, data.points3d).mean()
         turned = metrics.rotation_only_error(rec.shapes, data.points3d).mean()
@@ -122,6 +124,10 @@ def _reconstruct(arguments: argparse.Namespace) -> None:
         print(f"with rotations only: {turned:.4f} (all frames mirrored, or none)")
         if hand.left_out < 1:  # else the truth is flat, and has no hand
             print(f"frames mirrored against the others: {hand.mirrored:.1%}")
+    if rec.uncertainty is not None:
+        print(f"points may be off by {rec.doubt:.1%} of the object's size, in the mean")
+    if rec.agreement is not None:
+        print(f"shapes from another start differ by {rec.agreement:.3f} (normalised; small is a good sign)")
     print(f"coherence of the last dictionary: {rec.coherence:.3f}")
     if arguments.save:
         print(f"wrote {rec.save(arguments.save)}")

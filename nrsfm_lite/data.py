@@ -194,6 +194,10 @@ class Reconstruction:
         Covariance of each point about where it was put, in the frame of its camera: the image's two axes, then
         depth (the cross product of the camera's columns); in squared units of the input (chapter 10). That the whole
         shape may be mirrored in depth is not in it. None for methods that do not say.
+    agreement : float or None
+        Mean normalised error between the shapes from the start that was chosen and those from the start that comes
+        nearest to it. Where it is small, two ways have led to the same shapes; where it is large, one of them is wrong,
+        and it may be the other (chapter 10a). None where only one start was tried.
     coherence : float or None
         Mutual coherence of the last dictionary (chapter 10a); None for methods without one.
     method : str
@@ -222,6 +226,7 @@ class Reconstruction:
     names: tuple[str, ...] = ()
     edges: np.ndarray = field(default_factory=_no_edges)
     uncertainty: np.ndarray | None = None
+    agreement: float | None = None
     coherence: float | None = None
     method: str = ""
     converged: bool = True
@@ -254,6 +259,7 @@ class Reconstruction:
         shown = _share(self.visible)
         parts = ["shown all points" if shown == "all" else f"shown {shown} of the points"]
         parts += ["converged" if self.converged else "stopped before it converged"]
+        parts += [f"agreement {self.agreement:.3f}"] if self.agreement is not None else []
         parts += [f"coherence {self.coherence:.3f}"] if self.coherence is not None else []
         parts += ["with its network"] if self.model is not None else []
         return f"Reconstruction({self.method!r}: {_size(self.visible)}; {', '.join(parts)})"
@@ -266,6 +272,18 @@ class Reconstruction:
     def projections(self) -> np.ndarray:
         """(F, P, 2), the shapes seen by their cameras, in the units of the input."""
         return self.shapes @ self.cameras + self.translations[:, None]
+
+    @property
+    def doubt(self) -> float | None:
+        """How far points may be off in the mean, as a share of the shapes' size; None without an uncertainty.
+
+        The square root of the trace of each point's covariance, over the root mean square distance of the points from
+        their centroid. Of all scores without truth it ranks results best (chapter 10a).
+        """
+        if self.uncertainty is None:
+            return None
+        off = np.sqrt(np.trace(self.uncertainty, axis1=2, axis2=3)).mean()
+        return float(off / np.sqrt(np.square(self.shapes).sum(2).mean()))
 
     def save(self, path: str | Path) -> Path:
         """Write everything, the network's weights included, to one .npz without pickle; returns its path."""
@@ -300,7 +318,7 @@ class Reconstruction:
             except Exception:  # a network with a part missing, or of another version, can fail in any way
                 raise ValueError(f"{path}: the network in it is incomplete or of another version.") from None
         try:
-            for key in {"coherence", "method", "converged"} & values.keys():
+            for key in {"agreement", "coherence", "method", "converged"} & values.keys():
                 values[key] = values[key].item()
             return cls(**values)
         except ValueError as error:

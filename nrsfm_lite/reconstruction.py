@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from . import baselines, normalizer, shape_prior
-from .cameras import nearest_orthonormal
+from .cameras import nearest_orthonormal, nearness
 from .checks import one_of, truth, whole
 from .data import Reconstruction
 from .gaussian import scales
@@ -24,6 +26,8 @@ from .training import SCHEDULES, check_training, free_scale, learn_prior, or_war
 
 _CHUNK = 4096  # frames per pass: memory stays flat in the number of frames
 _FEW = 2000  # frames, up to which other starts than the network are tried
+_MIRROR = np.array([1.0, 1.0, -1.0])  # of shapes and of cameras: the images stay, all depths change their sign
+_SURE = 3.0  # standard errors by which hidden points must lie behind, on average, for the hand to be believed
 _REFINE_STEPS = 150
 _REFINE_RATE = 0.07
 
@@ -38,6 +42,7 @@ def reconstruct(
     projection: str | None = None,
     refine: bool | str = True,
     adapt: bool = False,
+    occlusion: bool = False,
     confidence: Any = None,
     seed: int = 0,
     device: str | torch.device | None = None,
@@ -75,6 +80,10 @@ def reconstruct(
         predicts what it has not seen better than the model's does. It takes longer, and pays for a film of a new
         motion, even one of some ten frames. Without it, each frame is reconstructed on its own. A model without a
         prior always learns it here.
+    occlusion : bool
+        What is hidden lies behind: of the result and its mirror image, the one in which hidden points are farther from
+        the viewer than visible ones, on average over all frames, is returned. For points that the object itself hides;
+        where a tracker lost them at random, it says nothing.
     confidence : (F, P), optional
         From 0 to 1: how far to trust each visible point; 0 hides it. A weight in the network's first layer and its
         loss; in the refinement, a point's noise is divided by it. Default: that of the Landmarks, else 1.
@@ -83,14 +92,21 @@ def reconstruct(
 
     Returns
     -------
-    Reconstruction in the units of W. Its `uncertainty` says how far each point may be off. No image decides between all
-    shapes and their mirror images; nor, in a collection, whether two of its members are of one hand.
+    Reconstruction in the units of W. Its `uncertainty` says how far each point may be off, and for up to 2,000 frames
+    that a prior was learned from, its `agreement` how far another start leads elsewhere. No image decides between all
+    shapes and their mirror images, unless `occlusion` does; nor, in a collection, whether two of its members are of
+    one hand.
 
     Raises
     ------
     ValueError
         As `fit`; also if `model` was trained for another number of points or another projection, and for arguments
-        that contradict each other or cannot act.
+        that contradict each other or cannot act, such as occlusion where nothing is hidden.
+
+    Warns
+    -----
+    UserWarning
+        If no prior could be learned, or if with `occlusion` hidden points lie neither behind nor in front.
 
     Examples
     --------
@@ -104,12 +120,14 @@ def reconstruct(
             f"adapt=True with refine={refine!r}; the prior that it learns is of use with refine=True only."
         )
     seed = whole("seed", seed, 0)
+    occlusion = truth("occlusion", occlusion)
     trained = model is None
     anew = adapt  # the prior is learned here, from these frames
     if model is None:
         plan = SCHEDULES["default"] if steps is None else replace(SCHEDULES["default"], steps=steps)
         device = check_training(seed, device, checkpoint)
         images = read_to_train(W, visible, confidence)
+        _check_hidden(images, occlusion)
         config = Config(images.n_points, projection=projection or "orthographic", translation=translation or False)
         anew = adapt or (refine is True and len(images) <= _FEW)
         model = train(
@@ -120,22 +138,29 @@ def reconstruct(
         _check_given(model, steps=steps, checkpoint=checkpoint, device=device)
         _check_same(model, projection=projection, translation=translation)
         images = read(W, visible, confidence, method="reconstruct", every_point=False)
+        _check_hidden(images, occlusion)
         if model.config.n_points != images.n_points:
             raise ValueError(f"model was trained for {model.config.n_points} points, but W has {images.n_points}.")
+    agreement = None
     with use_threads(1):  # as in `fit`: never slow on a busy machine, and the same result everywhere
         how: Prior | str | None = "code" if refine == "code" else None
         if refine is True:
             how = model.prior
             if anew or (how is None and not trained):  # else `train` has said why there is none
-                how = (
+                found = (
                     or_warn(lambda: _learn_prior(model, images, seed)) if trained else _learn_prior(model, images, seed)
                 )
+                how, agreement = found or (None, None)
             if trained:
                 model.prior = how
         S, M, t, doubt = _infer(model, images, how, progress)
+    if occlusion and _hidden_in_front(S, M, images.visible):
+        S, M = S * _MIRROR, M * _MIRROR[:, None]
+        doubt = None if doubt is None else doubt * np.outer(_MIRROR, _MIRROR)
     return images.reconstruction(
-        S, M, t, scale=1.0, uncertainty=doubt, method="deep_nrsfm", coherence=model.coherence, model=model
-    )
+        S, M, t, scale=1.0, uncertainty=doubt, agreement=agreement, method="deep_nrsfm", coherence=model.coherence,
+        model=model,
+    )  # fmt: skip
 
 
 def _check_given(model: DeepNRSfM, **training: Any) -> None:
@@ -155,8 +180,31 @@ def _check_same(model: DeepNRSfM, **settings: Any) -> None:
             raise ValueError(f"model was trained for {name}={own!r}, not {value!r}.")
 
 
-def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> Prior:
-    """The shape prior of these frames, or the model's own, if it has one that serves them better.
+def _check_hidden(images: Images, occlusion: bool) -> None:
+    """Refuse to ask hidden points where there are none."""
+    if occlusion and images.visible.all():
+        raise ValueError("occlusion=True needs hidden points, but every point is visible.")
+
+
+def _hidden_in_front(S: np.ndarray, M: np.ndarray, visible: np.ndarray) -> bool:
+    """Whether hidden points lie nearer to the viewer than visible ones, in the mean over the frames that hide some."""
+    some = ~visible.all(1)
+    depth, hidden = nearness(S[some], M[some]), ~visible[some]
+    size = np.sqrt(np.square(S[some]).sum(2).mean(1))
+    depth = depth / size[:, None]
+    nearer = (depth * hidden).sum(1) / hidden.sum(1) - (depth * ~hidden).sum(1) / (~hidden).sum(1)
+    error = nearer.std() / math.sqrt(len(nearer))
+    if abs(nearer.mean()) < _SURE * error:
+        warnings.warn(
+            f"hidden points lie neither behind nor in front of visible ones (by {-nearer.mean():.3f} ± {error:.3f} of "
+            "the object's size), so that which mirror image is right remains open.",
+            stacklevel=3,
+        )
+    return float(nearer.mean()) > 0
+
+
+def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> tuple[Prior, float | None]:
+    """The shape prior of these frames, or the model's own, if it has one that serves them better; and the agreement.
 
     What the network makes of them is where it starts, refined by the model's prior if there is one. Of few frames
     classical methods are tried, too: the network may be wrong.
@@ -165,23 +213,24 @@ def _learn_prior(model: DeepNRSfM, images: Images, seed: int) -> Prior:
     image, X, _ = model.normalizer.normalize(X, mean, weight)
     prior, free = model.prior, free_scale(model)
     if prior is None and len(images) > _FEW:
-        return learn_prior(model, image, X.cpu(), weight.cpu(), torch.Generator().manual_seed(seed))
+        return learn_prior(model, image, X.cpu(), weight.cpu(), torch.Generator().manual_seed(seed)), None
     with torch.no_grad():
         _, S, M = model.lift(image)
     X, weight, image, S, M = X.cpu(), weight.cpu(), image.double().cpu(), S.double().cpu(), M.double().cpu()
     if prior is not None:
         S, M = shape_prior.apply(prior, X, weight, M)
-    starts = [(S, M)]
+    starts, agreement = [(S, M)], None
     if len(images) <= _FEW:
         # In single precision: the last digits of another unit of length are gone, which can decide between two minima.
         for other_S, other_M in baselines.starts(image.float().double().numpy(), seed):
             # Into the network's world, so that its cameras of other frames remain a start for this prior.
             U, _, Vh = torch.linalg.svd(torch.einsum("fij,fkj->ik", M, torch.as_tensor(other_M)))
             starts.append((torch.as_tensor(other_S) @ (U @ Vh).mT, U @ Vh @ torch.as_tensor(other_M)))
-        S, M = starts[shape_prior.choose(X, weight, starts, free_scale=free)]
+        best, agreement = shape_prior.choose(X, weight, starts, free_scale=free)
+        S, M = starts[best]
     if prior is not None:
-        return shape_prior.adapt(prior, X, weight, S, M)
-    return shape_prior.learn(X, weight, S, M, free_scale=free)
+        return shape_prior.adapt(prior, X, weight, S, M), agreement
+    return shape_prior.learn(X, weight, S, M, free_scale=free), agreement
 
 
 def _infer(

@@ -36,6 +36,7 @@ from .gaussian import (
     without_noise,
 )
 from .gaussian import negative_log_likelihood as of_each_frame
+from .metrics import normalized_error
 from .normalizer import center, weighted_mean
 
 MOST_FRAMES = 20_000  # that `learn` takes a look at
@@ -112,7 +113,9 @@ def learn(X: Tensor, weight: Tensor, S: Tensor, M: Tensor, *, free_scale: bool =
     return best
 
 
-def choose(X: Tensor, weight: Tensor, starts: Sequence[tuple[Tensor, Tensor]], *, free_scale: bool = False) -> int:
+def choose(
+    X: Tensor, weight: Tensor, starts: Sequence[tuple[Tensor, Tensor]], *, free_scale: bool = False
+) -> tuple[int, float | None]:
     """Which of several starts leads to the prior under which images that it has not seen are likeliest.
 
     From each, a few iterations for one Gaussian; frames kept back judge, with their own cameras from the same start.
@@ -122,16 +125,25 @@ def choose(X: Tensor, weight: Tensor, starts: Sequence[tuple[Tensor, Tensor]], *
     ----------
     X, weight, free_scale : as in `learn`
     starts : pairs of S and M, as in `learn`
+
+    Returns
+    -------
+    Its number; and how far its shapes of the frames that judge are from those of the start that comes nearest to it,
+    as a mean normalised error. None if there is no other.
     """
     kept, rest = _kept_back(len(X))
     kept, rest = kept if len(kept) else rest, rest[: 2 * _FRAMES_OF_A_TRIAL]
-    values = []
+    frames = X[kept].double(), weight[kept]
+    values, shapes = [], []
     for S, M in starts:
         S, M = _checked(S.double()), M.double().clone()
         whole = without_noise(_whole(X[rest].double(), weight[rest], S[rest], M[rest], free_scale)[0])
-        frames = X[kept].double(), weight[kept]
-        values.append(_unlikeliness((whole,), (*frames, *_apply_whole(whole, *frames, M[kept]))))
-    return int(torch.tensor(values).nan_to_num(math.inf).argmin())
+        S, M = _apply_whole(whole, *frames, M[kept])
+        values.append(_unlikeliness((whole,), (*frames, S, M)))
+        shapes.append(S)
+    best = int(torch.tensor(values).nan_to_num(math.inf).argmin())
+    others = [S for k, S in enumerate(shapes) if k != best and math.isfinite(values[k])]
+    return best, min((float(normalized_error(S, shapes[best]).mean()) for S in others), default=None)
 
 
 def adapt(prior: Prior, X: Tensor, weight: Tensor, S: Tensor, M: Tensor) -> Prior:

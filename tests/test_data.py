@@ -214,10 +214,26 @@ def test_what_landmarks_and_reconstructions_say_of_themselves(landmarks, rng):
     views = nl.Landmarks(landmarks.points2d, visible, confidence=np.ones((6, 4)), points3d=np.zeros((6, 4, 3)))
     assert repr(views[:2]) == "Landmarks('landmarks': 2 frames × 4 points; images, 87.5% visible, confidence, 3D truth)"
     rec = nl.Reconstruction(
-        rng.normal(size=(1, 4, 3)), nl.cameras.random_cameras(1), method="bmm", coherence=0.25, converged=False
+        rng.normal(size=(1, 4, 3)),
+        nl.cameras.random_cameras(1),
+        method="bmm",
+        coherence=0.25,
+        agreement=0.5,
+        converged=False,
     )
-    said = "Reconstruction('bmm': 1 frame × 4 points; shown all points, stopped before it converged, coherence 0.250)"
-    assert repr(rec) == said
+    assert repr(rec) == (
+        "Reconstruction('bmm': 1 frame × 4 points; shown all points, stopped before it converged, agreement 0.500, "
+        "coherence 0.250)"
+    )
+
+
+def test_doubt_is_a_share_of_the_size(rng):
+    S, M = rng.normal(size=(5, 4, 3)), nl.cameras.random_cameras(5)
+    each = np.broadcast_to(np.eye(3) / 3, (5, 4, 3, 3))  # every point may be off by one
+    rec = nl.Reconstruction(S, M, uncertainty=each)
+    assert np.isclose(rec.doubt, 1 / np.sqrt((S**2).sum(2).mean()))
+    assert np.isclose(nl.Reconstruction(7 * S, M, uncertainty=49 * each).doubt, rec.doubt)
+    assert nl.Reconstruction(S, M).doubt is None
 
 
 def test_small_pictures_of_landmarks_and_reconstructions(rng):

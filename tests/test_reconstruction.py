@@ -213,6 +213,8 @@ def test_wrong_input_is_refused(views, rec):
         ({"adapt": True, "refine": "code"}, "adapt=True with refine='code'"),
         ({"adapt": "yes"}, "adapt='yes'; expected True or False"),
         ({"refine": 1}, "refine=1"),
+        ({"occlusion": 1}, "occlusion=1"),
+        ({"occlusion": True}, "every point is visible"),
         ({"seed": -1}, "seed=-1"),
         ({"seed": 0.5}, "seed=0.5"),
     ],
@@ -233,6 +235,8 @@ def test_the_same_is_refused_where_a_network_is_trained(views):
     ]:
         with pytest.raises(error, match=message):
             nl.reconstruct(views, progress=False, **wrong)
+    with pytest.raises(ValueError, match="every point is visible"):
+        nl.reconstruct(views, occlusion=True, progress=False)
     with pytest.raises(ValueError, match="model is a str; expected a DeepNRSfM"):
         nl.reconstruct(views, model="walk.npz")
 
@@ -271,3 +275,40 @@ def test_a_network_that_knows_nothing_does_not_spoil_the_refinement(views, rec):
     found = nl.reconstruct(views, model=bare)
     errors = [nl.metrics.normalized_error(r.shapes, views.points3d).mean() for r in (lost, found, rec)]
     assert errors[0] > 10 * errors[1] and errors[1] < 1.5 * errors[2]
+
+
+def test_what_is_hidden_lies_behind(views, rec):
+    depth = nl.cameras.nearness(views.points3d, views.cameras)
+
+    def hand(visible):
+        found = nl.reconstruct(views, visible, model=rec.model, occlusion=True)
+        return found, np.sign((nl.cameras.nearness(found.shapes, found.cameras) * depth).sum())
+
+    behind = nl.datasets.make_views(nl.datasets.make_motion(600, seed=7), seed=7, missing="self").visible
+    in_front = np.ones_like(behind)  # what would be behind in the mirror image
+    in_front[np.arange(600), depth.argmax(1)] = False
+    right, sign = hand(behind)
+    wrong, other = hand(in_front)
+    assert (sign, other) == (1, -1)
+    plain = nl.reconstruct(views, in_front, model=rec.model)
+    turned = wrong if np.abs(wrong.shapes - plain.shapes).max() > 1e-6 else right
+    plain = plain if turned is wrong else nl.reconstruct(views, behind, model=rec.model)
+    np.testing.assert_allclose(turned.projections, plain.projections, atol=1e-9)
+    signs = np.outer((1, 1, -1), (1, 1, -1))
+    np.testing.assert_allclose(turned.uncertainty, plain.uncertainty * signs, atol=1e-12)
+
+
+def test_points_hidden_by_chance_say_nothing_about_the_hand(views, rec):
+    by_chance = nl.datasets.make_views(views, seed=1, missing=1)
+    with pytest.warns(UserWarning, match="which mirror image is right remains open"):
+        nl.reconstruct(by_chance, model=rec.model, occlusion=True)
+
+
+def test_agreement_is_small_where_two_starts_lead_to_the_same(tmp_path):
+    easy = nl.datasets.make_views(nl.datasets.make_motion(50, seed=4), seed=4)
+    rec = nl.reconstruct(easy, steps=5, progress=False)
+    assert 0 <= rec.agreement < 0.02 and nl.Reconstruction.load(rec.save(tmp_path / "r")).agreement == rec.agreement
+    assert nl.reconstruct(easy, model=rec.model).agreement is None  # nothing was learned
+    assert nl.reconstruct(easy, model=rec.model, adapt=True).agreement is not None
+    noisy = np.random.default_rng(0).normal(size=(60, 31, 2))  # nothing to agree on
+    assert nl.reconstruct(noisy, steps=5, progress=False).agreement > 0.1

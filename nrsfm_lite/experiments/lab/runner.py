@@ -25,7 +25,7 @@ from pathlib import Path
 
 NAMES = (
     *("speed", "inference", "thresholds", "relaxation", "training", "coherence", "stress", "unseen"),
-    *("missing", "translation", "noise", "classic", "growth", "starts", "defaults"),
+    *("missing", "translation", "noise", "classic", "growth", "starts", "defaults", "films"),
 )
 _LIBRARIES = ("torch", "numpy", "scipy")
 _EXPERIMENTS = __package__.rpartition(".")[0]

@@ -124,8 +124,10 @@ def errors(key: str, rec: Reconstruction, frames: Landmarks) -> dict[str, object
     }
 
 
-def coverage(rec: Reconstruction, frames: Landmarks, share: float = 0.9) -> tuple[float, float]:
-    """Share of the points whose depth lies in its band of this probability, and the bands' median width.
+def coverage(
+    rec: Reconstruction, frames: Landmarks, share: float = 0.9, points: np.ndarray | None = None
+) -> tuple[float, float]:
+    """Share of the points (all, or those of a mask) whose depth lies in its band, and the bands' median width.
 
     Seen by each frame's camera, so that nothing is aligned but the sign of all depths: a mirrored frame counts as
     missed. The width is that of the whole band, over the root mean square distance of the true points from their
@@ -136,7 +138,8 @@ def coverage(rec: Reconstruction, frames: Landmarks, share: float = 0.9) -> tupl
     half = norm.ppf((1 + share) / 2) * np.sqrt(rec.uncertainty[..., 2, 2])
     off = np.abs(np.sign((found * true).sum()) * found - true)
     size = np.sqrt(np.square(truth).sum(2).mean())
-    return float((off < half).mean()), float(np.median(2 * half) / size)
+    chosen = np.ones_like(rec.visible) if points is None else points
+    return float((off < half)[chosen].mean()), float(np.median(2 * half[chosen]) / size)
 
 
 def variants(setting: str, values: Sequence[str], seeds: int, quick: bool) -> list[dict[str, object]]:
