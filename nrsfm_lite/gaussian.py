@@ -135,16 +135,17 @@ def limited(gaussian: Gaussian, rank: int | None) -> Gaussian:
     return replace(gaussian, covariance=C)
 
 
-def without_noise(gaussian: Gaussian, rank: int | None = None) -> Gaussian:
+def without_noise(gaussian: Gaussian, rank: int | None = None, *, share: float = 0.0) -> Gaussian:
     """The Gaussian less what its covariance holds in all directions alike, which goes to σ².
 
     The same variance in all directions cannot be told from noise of the images, and is taken for it. With a rank, it
     is that of the other directions; else it is read off the smallest tenth of the eigenvalues, twice, since the
-    smallest are estimated too small.
+    smallest are estimated too small. Where that is still too little, it is the eigenvalue below which a `share` of
+    all lie.
     """
     values, vectors = _directions(gaussian)
     if rank is None or rank >= len(values):
-        flat = 2 * values.quantile(0.1)
+        flat = torch.maximum(2 * values.quantile(0.1), values.quantile(share))
         every, basis = torch.linalg.eigh(gaussian.covariance)
         C = (basis * (every - flat).clamp(min=0)) @ basis.T
     else:

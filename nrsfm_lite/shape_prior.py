@@ -49,6 +49,7 @@ _ROUNDS_WITH_SCALES = 10  # scales are learned slowly
 _RANKS = (16, 8, 4, 2, 1, 0)  # that are tried for the whole, beside all directions, as long as there is hope
 _RIGID = 16  # components of rank zero to begin with, at most, before those that are alike are joined
 _FRAMES_PER_RIGID = 25  # on average, at least, to begin with
+_SHARES_OF_NOISE = (0.0, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)  # of the directions, that are tried for few frames
 _HOPELESS = 0.5  # by which −log p per coordinate is above the best, so that nothing of the kind is tried any further
 _ALIKE = 4e-3  # by which joining two components may raise −log p per coordinate
 _BORROWED, _SHARE_OF_THE_WIDER = 0.3, 0.1  # of the pooled covariance in a wider twin, and how many frames need one
@@ -86,8 +87,8 @@ def learn(X: Tensor, weight: Tensor, S: Tensor, M: Tensor, *, free_scale: bool =
     """
     X, S, M = X.double(), _checked(S.double()), M.double().clone()
     kept, rest = _kept_back(len(X))
-    if not len(kept):  # too few to decide anything
-        return (without_noise(_whole(X, weight, S, M, free_scale)[0]),)
+    if not len(kept):
+        return (_of_few(X, weight, S, M, free_scale),)
 
     def at(i: Tensor) -> _Frames:
         return X[i], weight[i], S[i], M[i]
@@ -319,6 +320,25 @@ def _whole(X, weight, S, M, free_scale):
         S, M = fit(gaussian, X, weight, M, 0)
         _, M, _, _ = right_hand(gaussian, X, weight, S, M)
     return gaussian, M
+
+
+def _of_few(X, weight, S, M, free_scale):
+    """One Gaussian of too few frames to keep some back: how much of it is noise is decided by points kept back.
+
+    From few frames, C takes up noise in directions of its own, and the smallest eigenvalues do not show it.
+    """
+    hidden = _points_kept_back(weight)
+    left = torch.where(hidden, 0, weight)
+    part = center(X, left)[0]
+    first, part_M = _whole(part, left, S, M, free_scale)
+    surprise = []  # −log p(points kept back | the others), cameras from the others
+    for share in _SHARES_OF_NOISE:
+        gaussian = without_noise(first, share=share)
+        _, found = _apply_whole(gaussian, part, left, part_M)
+        both = of_each_frame(gaussian, X, weight, found) - of_each_frame(gaussian, part, left, found)
+        surprise.append(float(both.sum()))
+    best = int(torch.tensor(surprise).nan_to_num(math.inf).argmin())
+    return without_noise(_whole(X, weight, S, M, free_scale)[0], share=_SHARES_OF_NOISE[best])
 
 
 def _best_rank(first, frames, kept):

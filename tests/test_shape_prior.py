@@ -178,3 +178,16 @@ def test_the_scale_of_every_frame_is_found(truth):
     assert np.corrcoef(found[True][1].log(), true.log())[0, 1] > 0.9
     errors = [error(found[free][0], shapes * true[:, None, None]) for free in (True, False)]
     assert errors[0] < 0.8 * errors[1]
+
+
+def test_the_noise_of_few_frames_is_measured_by_points_kept_back():
+    motion = nl.datasets.make_motion(100)
+    found = {}
+    for noise in (0.0, 0.05):
+        views = nl.datasets.make_views(motion, noise=noise)
+        rec = nl.baselines.em_gaussian(views, start="bmm", progress=False)
+        X = torch.as_tensor(views.points2d - views.points2d.mean(1, keepdims=True))
+        M, weight = torch.as_tensor(rec.cameras), torch.ones(X.shape[:2], dtype=torch.double)
+        (gaussian,) = shape_prior.learn(X, weight, torch.as_tensor(rec.shapes), M)
+        found[noise] = gaussian.noise**0.5 / float(X.square().mean().sqrt())
+    assert found[0.0] < 0.01 and 0.03 < found[0.05] < 0.1  # it was .01 when read off the eigenvalues alone
