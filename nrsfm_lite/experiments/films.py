@@ -24,7 +24,7 @@ _SHORT = (20, 50, 150)
 _CLASSICAL = ("em_gaussian bmm", "em_gaussian", "bmm", "cns")
 _DEFAULT = "reconstruct"
 _SEEDS = 10
-_SCORES = ("doubt", "agreement", "negative_log_likelihood", "coherence")
+SCORES = ("doubt", "agreement", "negative_log_likelihood", "coherence")
 
 
 def cases(quick: bool) -> list[dict[str, object]]:
@@ -57,7 +57,7 @@ def conditions(quick: bool) -> dict[str, object]:
 def measure(data: str, views: str, method: str, seed: int) -> dict[str, object]:
     """Errors of one film, and what the result says of itself."""
     frames = _frames(data, views, seed)
-    empty: dict[str, object] = dict.fromkeys((*_SCORES, "coverage", "hidden_coverage", "own_hand"), "")
+    empty: dict[str, object] = dict.fromkeys((*SCORES, "coverage", "hidden_coverage", "own_hand"), "")
     if method != _DEFAULT:
         name, *start = method.split()
         rec = getattr(baselines, name)(frames, progress=False, **({"start": start[0]} if start else {}))
@@ -86,7 +86,7 @@ def report(rows: list[dict[str, str]]) -> str:
         errors = np.array([float(r["error"]) for r in ours if (r["data"], r["views"]) == (data, views)])
         failed = int((errors > 2 * np.median(errors)).sum())
         text += f"\n{data}, {views}: {failed} of {len(errors)} above twice the median, {np.median(errors):.4f}"
-    for score in _SCORES:
+    for score in SCORES:
         pairs = np.array([(float(r[score]), float(r["error"])) for r in ours if r[score]])
         if len(pairs) > 2:
             text += f"\nrank correlation of {score} with the error, {len(pairs)} films: "
