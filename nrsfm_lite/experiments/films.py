@@ -87,12 +87,17 @@ def report(rows: list[dict[str, str]]) -> str:
         failed = int((errors > 2 * np.median(errors)).sum())
         text += f"\n{data}, {views}: {failed} of {len(errors)} above twice the median, {np.median(errors):.4f}"
     for score in SCORES:
-        pairs = np.array([(float(r[score]), float(r["error"])) for r in ours if r[score]])
-        if len(pairs) > 2:
-            text += f"\nrank correlation of {score} with the error, {len(pairs)} films: "
-            text += f"{spearmanr(*pairs.T).statistic:.2f}"
+        n, rho = rank(ours, score)
+        if n > 2:
+            text += f"\nrank correlation of {score} with the error, {n} films: {rho:.2f}"
     hands = [r["own_hand"] == "True" for r in ours if r["own_hand"]]
     return text + (f"\nhand right by occlusion: {sum(hands)} of {len(hands)}" if hands else "")
+
+
+def rank(rows: list[dict[str, str]], score: str) -> tuple[int, float]:
+    """How many films have a score, and Spearman's correlation of it and the error over them; nan for fewer than 3."""
+    pairs = np.array([(float(r[score]), float(r["error"])) for r in rows if r[score]])
+    return len(pairs), float(spearmanr(*pairs.T).statistic) if len(pairs) > 2 else float("nan")
 
 
 def _frames(data: str, views: str, seed: int) -> Landmarks:
