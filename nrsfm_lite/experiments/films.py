@@ -90,6 +90,7 @@ def report(rows: list[dict[str, str]]) -> str:
         n, rho = rank(ours, score)
         if n > 2:
             text += f"\nrank correlation of {score} with the error, {n} films: {rho:.2f}"
+            text += f"; within a kind {rank_within(ours, score):.2f}"
     hands = [r["own_hand"] == "True" for r in ours if r["own_hand"]]
     return text + (f"\nhand right by occlusion: {sum(hands)} of {len(hands)}" if hands else "")
 
@@ -98,6 +99,13 @@ def rank(rows: list[dict[str, str]], score: str) -> tuple[int, float]:
     """How many films have a score, and Spearman's correlation of it and the error over them; nan for fewer than 3."""
     pairs = np.array([(float(r[score]), float(r["error"])) for r in rows if r[score]])
     return len(pairs), float(spearmanr(*pairs.T).statistic) if len(pairs) > 2 else float("nan")
+
+
+def rank_within(rows: list[dict[str, str]], score: str) -> float:
+    """The same among films of one kind, data and views: the mean over all kinds that have at least 3 such films."""
+    kinds = dict.fromkeys((r["data"], r["views"]) for r in rows)
+    each = [rank([r for r in rows if (r["data"], r["views"]) == kind], score) for kind in kinds]
+    return float(np.mean([rho for n, rho in each if n > 2] or float("nan")))
 
 
 def _frames(data: str, views: str, seed: int) -> Landmarks:
